@@ -155,7 +155,7 @@ class Method(Protocol):
     @property
     def video_only(self) -> bool:
         """True where no still is ever wanted, so that the base stream may take the whole budget."""
-        ...
+        return False
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """The requests of this step, most useful first, at most one a track; the same for the same input."""

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 from hvt_common.inference.class_names import MOVING, same_kind
-from hvt_edge.stills.policy.base import Request, Step, ranked
+from hvt_edge.stills.policy.base import Method, Request, Step, ranked
 
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
@@ -31,7 +31,7 @@ _MOST_LOGIT = 50.0
 
 
 @dataclass(frozen=True, slots=True)
-class ExpectedGain:
+class ExpectedGain(Method):
     """Highest expected gain per byte first, from ``min_gain`` on, as many as ``lookahead`` times the allowance holds.
 
     Requests beyond it are for neighbours that may share a still, and for the queue.
@@ -72,8 +72,7 @@ class ExpectedGain:
     min_gain: float = 0.02
     """Nothing below it is sent: about twice the rate at which a still spoils a class that was right."""
     lookahead: float = 3.0
-    name: str = field(default="M6", init=False)
-    video_only: bool = field(default=False, init=False)
+    name: ClassVar[str] = "M6"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """Best first; always at least the best one, so that it waits for its allowance."""

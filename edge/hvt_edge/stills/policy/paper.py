@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
-from hvt_edge.stills.policy.base import Request, Step, ranked
+from hvt_edge.stills.policy.base import Method, Request, Step, ranked
 
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
 
 @dataclass(frozen=True, slots=True)
-class VideoOnly:
+class VideoOnly(Method):
     """M0, the baseline: no stills; the whole budget may go to the base stream."""
 
-    name: str = field(default="M0", init=False)
-    video_only: bool = field(default=True, init=False)
+    name: ClassVar[str] = "M0"
+    video_only: ClassVar[bool] = True
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
         return []
@@ -32,17 +32,16 @@ class VideoOnly:
 class TracksFirst(VideoOnly):
     """R0: no stills, as M0; the encoder spends its bits on the tracks (``--roi-depth``)."""
 
-    name: str = field(default="R0", init=False)
+    name: ClassVar[str] = "R0"
 
 
 @dataclass(frozen=True, slots=True)
-class Periodic:
+class Periodic(Method):
     """M1: each active track falls due at a fixed interval, from its first frame on; most overdue first."""
 
     every_frames: int = 15
     """The paper's interval: one second at 15 fps."""
-    name: str = field(default="M1", init=False)
-    video_only: bool = field(default=False, init=False)
+    name: ClassVar[str] = "M1"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """Tracks whose last still is ``every_frames`` or more behind."""
@@ -56,13 +55,12 @@ class Periodic:
 
 
 @dataclass(frozen=True, slots=True)
-class OnStart:
+class OnStart(Method):
     """M2: a still when a track begins, and when it is found again; those that wait longest come first."""
 
     patience_s: float = 1.0
     """How long a start may wait for its still, be it for its allowance or to come away from the border."""
-    name: str = field(default="M2", init=False)
-    video_only: bool = field(default=False, init=False)
+    name: ClassVar[str] = "M2"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """Tracks whose last start has not been answered yet."""
@@ -78,15 +76,14 @@ class OnStart:
 
 
 @dataclass(frozen=True, slots=True)
-class Uncertain:
+class Uncertain(Method):
     """M3: confidence below a threshold: the classifier's once the ground has named the track, else the detector's."""
 
     detector_confidence: float = 0.5
     """Below it the detector is unsure (0.50 is the strictest confidence in the pilot's table)."""
     classifier_confidence: float = 0.5
     """Below it no class has the absolute majority."""
-    name: str = field(default="M3", init=False)
-    video_only: bool = field(default=False, init=False)
+    name: ClassVar[str] = "M3"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
         return ranked(candidates, score=self._doubt, reason="uncertain")
@@ -100,13 +97,12 @@ class Uncertain:
 
 
 @dataclass(frozen=True, slots=True)
-class Small:
+class Small(Method):
     """M4: area below a threshold, smallest first."""
 
     area_share: float = 0.015
     """Of the base frame (the pilot's "small"): 118x118 pixels of 1280x720."""
-    name: str = field(default="M4", init=False)
-    video_only: bool = field(default=False, init=False)
+    name: ClassVar[str] = "M4"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
         """Tracks whose box takes less of the frame than ``area_share``."""
@@ -118,7 +114,7 @@ class Small:
 
 
 @dataclass(frozen=True, slots=True)
-class Utility:
+class Utility(Method):
     """M5: highest score first, above a threshold that follows from the budget's allowance."""
 
     uncertainty_weight: float = 0.5
@@ -132,8 +128,7 @@ class Utility:
     """Least ``C``: keeps a wrong cost estimate from ruling the order."""
     min_score: float = 0.1
     """Nothing below it is sent, whatever the budget allows."""
-    name: str = field(default="M5", init=False)
-    video_only: bool = field(default=False, init=False)
+    name: ClassVar[str] = "M5"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """As many of the best as the allowance holds, and always the best one, so that it waits for its allowance.

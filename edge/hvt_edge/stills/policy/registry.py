@@ -35,7 +35,7 @@ class MethodEntry:
 
 def _entry(make: type[Any]) -> MethodEntry:
     defaults = make()
-    tunable: dict[str, float] = {one.name: getattr(defaults, one.name) for one in fields(make) if one.init}
+    tunable: dict[str, float] = {one.name: getattr(defaults, one.name) for one in fields(make)}
     return MethodEntry(make, MappingProxyType(tunable))
 
 

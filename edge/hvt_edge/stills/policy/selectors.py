@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hvt_common.inference.class_names import same_kind
 from hvt_common.values import Boxes
-from hvt_edge.stills.policy.base import Request, Step
+from hvt_edge.stills.policy.base import Method, Request, Step
 
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
@@ -55,42 +55,31 @@ def select(
     confidences: npt.ArrayLike,
     class_names: Sequence[str],
     frame_area_px: float,
-) -> npt.NDArray[np.int64]:
-    """Indices of the detections of one frame that the selector keeps, best first; ties keep the detections' order.
+) -> list[tuple[int, float, bool]]:
+    """(index, score, whether it is small) of the detections of one frame that the selector takes, best first.
 
-    ``boxes_xyxy_px`` is (N, 4) in base pixels, ``class_names`` the N names of the detections' classes.
+    Ties keep the detections' order. ``boxes_xyxy_px`` is (N, 4) in base pixels, ``class_names`` the N names of the
+    detections' classes.
     """
     confidence = np.asarray(confidences, np.float64).reshape(-1)
-    passed, score, _ = _judge(selector, boxes_xyxy_px, confidence, class_names, frame_area_px)
-    indices = np.flatnonzero(passed)
-    best = np.argsort(-score[indices], kind="stable")[: selector.per_frame]
-    return indices[best].astype(np.int64)
-
-
-def _judge(
-    selector: Selector,
-    boxes_xyxy_px: Boxes,
-    confidence: npt.NDArray[np.float64],
-    class_names: Sequence[str],
-    frame_area_px: float,
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    # Per detection: passes the filters, score, is small.
     boxes = np.asarray(boxes_xyxy_px, np.float64).reshape(-1, 4)
     width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     small = width * height / frame_area_px < selector.small_share
-    allowed = {name: _allows(selector, name) for name in set(class_names)}
+    kinds = selector.kinds
+    allowed = {
+        name: kinds is None or any(same_kind(name, kind) for kind in kinds) for name in set(class_names)
+    }
     passed = np.array([allowed[name] for name in class_names], np.bool_)
     passed &= (width >= selector.min_side_px) & (height >= selector.min_side_px)
     passed &= confidence >= selector.min_confidence
-    return passed, selector.small_weight * small + selector.doubt_weight * (1 - confidence), small
-
-
-def _allows(selector: Selector, class_name: str) -> bool:
-    return selector.kinds is None or any(same_kind(class_name, kind) for kind in selector.kinds)
+    score = selector.small_weight * small + selector.doubt_weight * (1 - confidence)
+    indices = np.flatnonzero(passed)
+    best = indices[np.argsort(-score[indices], kind="stable")[: selector.per_frame]]
+    return list(zip(best.tolist(), score[best].tolist(), small[best].tolist(), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
-class SelectorMethod:
+class SelectorMethod(Method):
     """A selector as a method: it sees the candidates that a detection of this very frame backs."""
 
     selector: Selector
@@ -99,10 +88,6 @@ class SelectorMethod:
     def name(self) -> str:
         return self.selector.name
 
-    @property
-    def video_only(self) -> bool:
-        return False
-
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """At most ``per_frame`` requests; nothing on frames between detections."""
         seen = sorted((one for one in candidates if one.detected), key=lambda one: one.track_id)
@@ -110,9 +95,7 @@ class SelectorMethod:
         confidence = np.array([one.confidence for one in seen], np.float64)
         names = [one.class_name for one in seen]
         area = float(step.base_size[0] * step.base_size[1])
-        chosen = select(self.selector, boxes, confidence, names, area)
-        _, score, small = _judge(self.selector, boxes, confidence, names, area)
         return [
-            Request(seen[index], "small" if small[index] else "low confidence", float(score[index]))
-            for index in chosen.tolist()
+            Request(seen[index], "small" if small else "low confidence", score)
+            for index, score, small in select(self.selector, boxes, confidence, names, area)
         ]

@@ -34,6 +34,11 @@ ORDER = {
 }
 
 
+def selected(*given) -> list[int]:
+    """The indices alone."""
+    return [index for index, *_ in select(*given)]
+
+
 def by_hand(name: str, boxes, confidences, names, area) -> list[int]:
     """The selection in plain loops."""
     least, top, side, classes, share = TABLE[name]
@@ -69,8 +74,8 @@ def test_selectors_agree_with_the_table(name, rows):
     boxes = np.array([(x, y, x + w, y + h) for x, y, w, h, _, _ in rows], np.float32).reshape(-1, 4)
     confidences = np.array([row[4] for row in rows], np.float32)
     names = [row[5] for row in rows]
-    chosen = select(BY_NAME[name], boxes, confidences, names, AREA)
-    assert chosen.tolist() == by_hand(name, boxes, confidences, names, AREA)
+    chosen = selected(BY_NAME[name], boxes, confidences, names, AREA)
+    assert chosen == by_hand(name, boxes, confidences, names, AREA)
 
 
 @pytest.mark.realdata
@@ -89,7 +94,7 @@ def test_selectors_agree_on_real_detections(data, word):
         boxes = np.concatenate([xywh[:, :2], xywh[:, :2] + xywh[:, 2:]], axis=1)
         confidences = np.array([float(row["prob"]) for row in rows], np.float32)
         for name, row in BY_NAME.items():
-            chosen = select(row, boxes, confidences, [word] * len(rows), area).tolist()
+            chosen = selected(row, boxes, confidences, [word] * len(rows), area)
             assert chosen == by_hand(name, boxes, confidences, [word] * len(rows), area)
             picked[name] += len(chosen)
     assert len(frames) > 300
@@ -121,22 +126,22 @@ def test_known_answer():
         "balanced_top2": [2, 1],
     }
     for name, indices in expected.items():
-        assert select(BY_NAME[name], boxes, confidences, names, AREA).tolist() == indices
+        assert selected(BY_NAME[name], boxes, confidences, names, AREA) == indices
 
 
 def test_strict_small_only_falls_back_to_what_is_not_small():
     """The pilot's selector keeps one ROI a frame even where nothing is small; the name misleads."""
     boxes = np.array([(0, 0, 300, 300), (0, 0, 400, 300)], np.float32)
-    chosen = select(BY_NAME["strict_small_only"], boxes, np.array([0.9, 0.8]), ["car", "car"], AREA)
-    assert chosen.tolist() == [1]
+    chosen = selected(BY_NAME["strict_small_only"], boxes, np.array([0.9, 0.8]), ["car", "car"], AREA)
+    assert chosen == [1]
 
 
 def test_ties_keep_the_order_of_detection():
     """The same frame would give another ROI on another machine."""
     boxes = np.array([(0, 0, 30, 30)] * 5, np.float32)
-    chosen = select(BY_NAME["permissive"], boxes, np.full(5, 0.5), ["car"] * 5, AREA)
-    assert chosen.tolist() == [0, 1, 2]
-    assert select(BY_NAME["permissive"], np.empty((0, 4)), np.empty(0), [], AREA).tolist() == []
+    chosen = selected(BY_NAME["permissive"], boxes, np.full(5, 0.5), ["car"] * 5, AREA)
+    assert chosen == [0, 1, 2]
+    assert selected(BY_NAME["permissive"], np.empty((0, 4)), np.empty(0), [], AREA) == []
 
 
 def test_as_a_method_only_this_frame_s_detections_count():
