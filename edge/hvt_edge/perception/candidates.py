@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache
 
 import cv2
@@ -180,13 +180,17 @@ class _History:
     border_since_ns: int | None = None
     border_area_px: float = 0.0
     sent_count: int = 0
-    sent_frame: int | None = None
-    sent_ns: int | None = None
-    sent_area_px: float | None = None
-    sent_sharpness: float | None = None
-    sent_at_border: bool = False
-    refused_ns: int | None = None
-    class_posterior: ClassPosterior | None = None
+    last_sent_frame: int | None = None
+    last_sent_ns: int | None = None
+    last_sent_area_px: float | None = None
+    last_sent_sharpness: float | None = None
+    last_sent_at_border: bool = False
+    last_refused_ns: int | None = None
+    posterior: ClassPosterior | None = None
+
+
+_REMEMBERED = {one.name for one in fields(_History)} & {one.name for one in fields(Candidate)}
+"""What a candidate says of the past of its track."""
 
 
 class TrackMemory:
@@ -231,17 +235,17 @@ class TrackMemory:
         if history is None:
             return
         history.sent_count += 1
-        history.sent_frame = frame_index
-        history.sent_ns = now_ns
-        history.sent_area_px = candidate.area_px
-        history.sent_sharpness = candidate.sharpness() if candidate.sharpness else None
-        history.sent_at_border = candidate.touches_border
+        history.last_sent_frame = frame_index
+        history.last_sent_ns = now_ns
+        history.last_sent_area_px = candidate.area_px
+        history.last_sent_sharpness = candidate.sharpness() if candidate.sharpness else None
+        history.last_sent_at_border = candidate.touches_border
 
     def record_refused(self, track_id: int, *, now_ns: int) -> None:
         """Note that the still stage had no still for it; suppression then lets it rest for a while."""
         history = self._histories.get(track_id)
         if history is not None:
-            history.refused_ns = now_ns
+            history.last_refused_ns = now_ns
 
     def record_feedback(
         self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
@@ -249,7 +253,7 @@ class TrackMemory:
         """Note the answer of the ground's classifier for the track; unknown tracks are ignored."""
         history = self._histories.get(track_id)
         if history is not None:
-            history.class_posterior = ClassPosterior(class_name, confidence, entropy_nats)
+            history.posterior = ClassPosterior(class_name, confidence, entropy_nats)
 
     def candidates(
         self,
@@ -304,14 +308,7 @@ class TrackMemory:
                     else (now_ns - history.border_since_ns) / 1e9,
                     leaving=leaving,
                     covered_share=covered[row],
-                    sent_count=history.sent_count,
-                    last_sent_frame=history.sent_frame,
-                    last_sent_ns=history.sent_ns,
-                    last_sent_area_px=history.sent_area_px,
-                    last_sent_sharpness=history.sent_sharpness,
-                    last_sent_at_border=history.sent_at_border,
-                    last_refused_ns=history.refused_ns,
-                    posterior=history.class_posterior,
+                    **{name: getattr(history, name) for name in _REMEMBERED},
                     sharpness=sharp,
                     loss=loss,
                 )
