@@ -7,8 +7,8 @@ even for a model given as bytes, relative to the working folder).
 
 from __future__ import annotations
 
+import functools
 import mmap
-import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -58,16 +58,8 @@ def check_onnx_file(path: Path) -> None:
     if not path.is_file():
         raise UserError(f"model {path} is not a file; an ONNX file is expected")
     try:
-        with path.open("rb") as file:
-            size_bytes = os.fstat(file.fileno()).st_size
-            if size_bytes > MAX_MODEL_BYTES:
-                raise UserError(
-                    f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted"
-                )
-            if not size_bytes:
-                raise UserError(f"model {path} is not an ONNX file (it is empty)")
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                _check(path, data)
+        status = path.stat()
+        _check_file(path, (status.st_ino, status.st_size, status.st_mtime_ns))
     except OSError as error:
         raise UserError(f"model {path} cannot be read: {error.strerror}") from error
 
@@ -100,6 +92,18 @@ def _top_fields(path: Path) -> Iterator[tuple[int, int, bytes]]:
         for field, _, value, begin, end in _fields(data, 0, len(data)):
             if field != _GRAPH_FIELD:
                 yield field, value, data[begin:end]
+
+
+@functools.lru_cache(maxsize=16)
+def _check_file(path: Path, version: tuple[int, int, int]) -> None:
+    # Once for each ``version`` of a file, of four that ask while a detector is opened.
+    size_bytes = version[1]
+    if size_bytes > MAX_MODEL_BYTES:
+        raise UserError(f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted")
+    if not size_bytes:
+        raise UserError(f"model {path} is not an ONNX file (it is empty)")
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        _check(path, data)
 
 
 def _check(path: Path, data: mmap.mmap) -> None:

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from hvt_common.errors import UserError
+from hvt_common.inference.runtimes import model_file
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.model_file import MAX_MODEL_BYTES
 from hvt_common.runtime.process import with_lower_priority
@@ -96,6 +97,22 @@ def test_a_file_over_the_cap_is_not_even_parsed(tmp_path: Path) -> None:
         file.truncate(MAX_MODEL_BYTES + 1)
     with pytest.raises(UserError, match=str(MAX_MODEL_BYTES + 1)):
         open_model(path)
+
+
+def test_a_file_is_gone_through_once_and_again_where_it_is_another(tmp_path: Path, monkeypatch) -> None:
+    """Each start would go through a model four times; or a file that was replaced would count as whole."""
+    path, passes = constant_model(tmp_path / "model.onnx", np.ones((1, 2))), []
+    through = model_file.mmap.mmap
+    monkeypatch.setattr(
+        model_file.mmap, "mmap", lambda *given, **named: passes.append(1) or through(*given, **named)
+    )
+    for _ in range(3):
+        model_file.check_onnx_file(path)
+    assert len(passes) == 1
+    path.write_bytes(path.read_bytes()[:-9])
+    for _ in range(2):
+        with pytest.raises(UserError, match="cut short"):
+            model_file.check_onnx_file(path)
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
