@@ -152,10 +152,8 @@ class Ground:
             notify_systemd("READY=1")
             self._say_where(
                 line,
-                pages=(
-                    *([] if view is None else [view.page]),
-                    *(link for one in services for link in one.links),
-                ),
+                view="" if view is None else view.page,
+                pages=[link for one in services for link in one.links],
                 late={one.part for one in models.failures.now},
             )
             try:
@@ -174,15 +172,17 @@ class Ground:
             for content, sinks in self._ended[edge]
         ]
 
-    def _say_where(self, line: StatusLine, *, pages: Sequence[str], late: Collection[str]) -> None:
+    def _say_where(self, line: StatusLine, *, view: str, pages: Sequence[str], late: Collection[str]) -> None:
         config = self._config
         if config.connect:
             line.note(f"hvt-ground: connecting to {', '.join(config.connect)}")
         if config.listen or not (config.connect or config.zenoh_config):
             yet = "not yet " * ("listener" in late)
             line.note(f"hvt-ground: {yet}listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
-        for page in filter(None, pages):
-            line.note(f"hvt-ground: watch at {page}")
+        for page in filter(None, (view, *pages)):
+            # Until then another program answers there.
+            later = ", once it is free" * (page != view and "web page" in late)
+            line.note(f"hvt-ground: watch at {page}{later}")
 
     def _serve(
         self,

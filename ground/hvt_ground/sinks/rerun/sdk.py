@@ -29,6 +29,8 @@ import rerun_bindings as bindings
 
 from hvt_common.errors import UserError
 
+os.environ.pop("RERUN", None)  # the SDK's switch: with "off" recordings and live views would stay empty
+
 _list_of_recordings = threading.RLock()
 
 

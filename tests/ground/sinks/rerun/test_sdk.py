@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -58,6 +59,22 @@ def test_recordings_have_the_same_paths(tmp_path):
     first = paths(0)
     assert any("/visualizers/" in one for one in first)
     assert paths(1) == first
+
+
+def test_the_sdks_switch_leaves_no_recording_empty(tmp_path):
+    """Who has RERUN=off for other programs of the machine flew, and found a file of no bytes."""
+    program = """
+import sys
+from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording
+
+recording = new_recording(RecordingId("uav-1", "0"))
+recording.log_file_from_contents("a.txt", b"a")
+recording.save(sys.argv[1])
+"""
+    out = tmp_path / "flight.rrd"
+    command = [sys.executable, "-c", program, str(out)]
+    subprocess.run(command, env=os.environ | {"RERUN": "off"}, capture_output=True, check=True)
+    assert out.stat().st_size > 0
 
 
 def test_recordings_that_begin_and_end_at_once_do_not_stop_the_process(tmp_path):
