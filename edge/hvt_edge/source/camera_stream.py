@@ -170,6 +170,8 @@ class CameraDecoder:
         """Whether all since a keyframe was decoded."""
         self.trouble = ""
         """The fault of the newest unit that was left out, in a few words."""
+        self.is_other = False
+        """Whether that one is whole, and of another size or format than is taken."""
 
     def expect(self, size: tuple[int, int]) -> None:
         """From now on a picture of another size (width, height) is not taken."""
@@ -195,16 +197,16 @@ class CameraDecoder:
             self._leave_out("a unit cannot be decoded by itself")
             return None
         if picture.frame.format.name not in _FORMATS:
-            self._leave_out(f"a picture has the format {picture.frame.format.name}")
+            self._leave_out(f"a picture has the format {picture.frame.format.name}", is_other=True)
             return None
         if self._size is not None and picture.size != self._size:
-            self._leave_out(f"a picture has {picture.size[0]}x{picture.size[1]} pixels")
+            self._leave_out(f"a picture has {picture.size[0]}x{picture.size[1]} pixels", is_other=True)
             return None
         self._whole = True
         return unit, picture
 
-    def _leave_out(self, why: str) -> None:
-        self._whole, self.trouble = False, why
+    def _leave_out(self, why: str, *, is_other: bool = False) -> None:
+        self._whole, self.trouble, self.is_other = False, why, is_other
 
 
 def open_units(name: str, stream: Any) -> CameraUnits:

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from hvt_common.errors import NotYetError
+from hvt_common.errors import FlightError, NotYetError
 from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, Image
 from hvt_edge.source.camera_stream import (
     CameraDecoder,
@@ -30,6 +31,8 @@ from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, pa
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 """A camera is surveyed before the flight until its second keyframe, within these."""
+_MOST_OTHER_NS = 10 * SECOND_NS
+"""A camera that sends pictures of another size or format for longer does not return to those of the start."""
 QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
 _IDLE_S = 1.0
 
@@ -90,6 +93,7 @@ class CodedLiveSource(LiveSource):
         self.warning = ""
         self._queue: deque[_Queued] = deque()
         self._queued_bytes = self._number = 0
+        self._other_since_ns: int | None = None
         self._skips = False
         """Units are left out up to the next keyframe because the reader was too slow for some."""
         super().__init__(grabber, replace(settings, fps=1.0), clock=clock, failures=failures)
@@ -133,11 +137,24 @@ class CodedLiveSource(LiveSource):
                 self._failures.failed(
                     SOURCE_PART, f"{self._grabber.name} sends what cannot be passed on ({decoder.trouble})"
                 )
+                self._check_other(decoder, item.capture_ns)
             return None
         self._failures.works(SOURCE_PART)
-        self._skips = False
+        self._skips, self._other_since_ns = False, None
         unit, picture = decoded
         return self._resizer.coded_frame(picture.bgr(), unit, index=index, capture_ns=item.capture_ns)
+
+    def _check_other(self, decoder: CameraDecoder, now_ns: int) -> None:
+        # A new start takes what the camera sends now.
+        if not decoder.is_other:
+            self._other_since_ns = None
+            return
+        self._other_since_ns = self._other_since_ns or now_ns
+        if now_ns - self._other_since_ns > _MOST_OTHER_NS:
+            raise FlightError(
+                f"source {self._grabber.name} has changed ({decoder.trouble}), and --encoder passthrough sends what"
+                " it began with: start the edge again"
+            )
 
     def _note_left_out(self) -> None:
         with self._news:

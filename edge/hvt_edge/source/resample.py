@@ -95,7 +95,7 @@ class Resizer:
         view: the map from source to base pixels. Pictures follow it to within half a pixel of the base, because
             borders and cuts lie on whole pixels.
 
-    Pictures that are black or the same for long are told of in the log, under ``name``.
+    Pictures of another size, and those that are black or the same for long, are told of in the log, under ``name``.
     """
 
     def __init__(
@@ -105,9 +105,11 @@ class Resizer:
         self.view = View.fitted(source_size, size, fit=fit)
         self._fit, self._name = fit, name
         self._condition = PictureCondition()
+        self._sizes = {source_size}
 
     def frame(self, source_bgr: Image, *, index: int, capture_ns: int) -> Frame:
         """The base frame of a picture, which is first fitted to the source size if it has another. Both read-only."""
+        self._tell_size(source_bgr.shape[1], source_bgr.shape[0])
         whole = into_canvas(source_bgr, self.view.source_size)
         whole.flags.writeable = False
         base = self._resized(whole)
@@ -119,6 +121,16 @@ class Resizer:
     def coded_frame(self, picture: Image, unit: CameraUnit, *, index: int, capture_ns: int) -> Frame:
         """The frame of a camera's own unit, of which ``picture`` was decoded: source and base are the same."""
         return replace(self.frame(picture, index=index, capture_ns=capture_ns), camera_unit=unit)
+
+    def _tell_size(self, wide: int, high: int) -> None:
+        if (wide, high) not in self._sizes:
+            self._sizes.add((wide, high))
+            first = f"{self.view.source_size[0]}x{self.view.source_size[1]}"
+            _log.warning(
+                "%s: a picture is %dx%d, the first was %s: it is fitted into %s, in video and stills; a new start of"
+                " the edge goes by its first picture again",
+                *(self._name, wide, high, first, first),
+            )
 
     def _resized(self, source: Image) -> Image:
         if self.view.source_size == self.view.base_size:

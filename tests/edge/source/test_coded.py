@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pytest
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder, nal_kind, nal_units, parameter_sets
@@ -301,3 +301,17 @@ def test_a_picture_size_that_changes_within_the_first_connection_is_told_of(unit
     assert len(shown) > 10
     assert {picture.shape for picture in shown} == {(SIZE[1], SIZE[0], 3)}
     assert told
+
+
+def test_a_camera_that_stays_with_another_size_ends_the_flight(units, tmp_path, monkeypatch):
+    """The edge went on without a picture for ever, though a new start would have taken the camera as it is now."""
+    monkeypatch.setattr(coded_live, "_MOST_OTHER_NS", 4 * 10**8)
+    turned = packets_of(write_clip(tmp_path / "a.hevc", hard_pictures(25, size=(384, 256)), fps=25))
+    grabber = Turning([*units, *units, *turned])
+    settings = SourceSettings(size=lambda size: size, fps=15)
+    with (
+        CodedLiveSource(grabber, settings) as source,
+        pytest.raises(FlightError, match="a picture has 384x256 pixels"),
+    ):
+        for _ in source.steps(start_ns=0):
+            pass

@@ -177,6 +177,15 @@ def test_fine_texture_is_averaged_and_not_aliased():
     assert frame.base_bgr.std() < 50  # picking single pixels gives about 127
 
 
+def test_pictures_of_another_size_are_told_of_once(caplog):
+    """A stream that begins small, or a folder with a thumbnail in front, was small to its end without a word."""
+    resizer = Resizer((64, 48), (64, 48), fit="letterbox", name="cam")
+    for index, size in enumerate([(64, 48), (640, 480), (640, 480), (64, 48), (640, 480), (48, 64)]):
+        resizer.frame(np.full((*size[::-1], 3), index, np.uint8), index=index, capture_ns=index)
+    said = [record.message.partition(",")[0] for record in caplog.records]
+    assert said == ["cam: a picture is 640x480", "cam: a picture is 48x64"]
+
+
 def test_broadcast_rates_are_exact():
     """29.97 typed by a user and 30000/1001 from a container would drift apart from what was meant."""
     assert exact_rate(30000 / 1001) == Fraction(30000, 1001)
