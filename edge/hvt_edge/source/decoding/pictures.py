@@ -12,11 +12,15 @@ import av.error
 import numpy as np
 import numpy.typing as npt
 from av.filter import Graph
-from av.sidedata.sidedata import SideDataContainer
+from av.sidedata.sidedata import SideDataContainer, Type
 from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, Interpolation, VideoReformatter
 
 from hvt_common.values import Image
 from hvt_edge.source.contract import Notes
+
+# PyAV refuses all side data of a frame where FFmpeg has put a kind by it that PyAV has no name for, such as the EXIF
+# data of a JPEG. Such a kind goes by the name of one that nobody reads here.
+Type._missing_ = classmethod(lambda cls, value: cls.VIDEO_HINT)  # type: ignore[assignment] # noqa: ARG005
 
 _UNTAGGED_SD_PX = 576
 """A picture that says no colour matrix is BT.601 with at most so many lines, else BT.709: as players take it."""

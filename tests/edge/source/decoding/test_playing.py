@@ -196,6 +196,23 @@ def test_a_picture_is_turned_and_mirrored_as_it_says(tmp_path, degrees, mirror):
     assert max(int(blue), int(green)) < 60
 
 
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_jpeg_with_exif_data_is_shown_and_turned(tmp_path, orientation):
+    """A camera of JPEGs with EXIF data, in a clip or over HTTP, ended the edge with a traceback."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    picture = np.zeros((96, 128, 3), np.uint8)
+    picture[:48] = 255
+    clip = tmp_path / "a.mjpeg"
+    with clip.open("wb") as out:
+        for _ in range(3):
+            Image.fromarray(picture).save(out, "JPEG", exif=exif)
+    _, pictures = play(clip)
+    upright = picture if orientation == 1 else np.rot90(picture, -1)
+    assert pictures[-1].shape == upright.shape
+    assert np.abs(pictures[-1].astype(int) - upright).mean() < 5
+
+
 def test_a_picture_that_nobody_needs_is_let_go_at_once(tmp_path):
     """Garbage that waits for Python's collector is a hundred megabytes of pictures."""
     clip = write_numbered(tmp_path / "a.mp4", 4, setup=lambda stream: stream.set_display_rotation(90))
