@@ -31,7 +31,7 @@ from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, pa
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 """A camera is surveyed before the flight until its second keyframe, within these."""
-_MOST_OTHER_NS = 10 * SECOND_NS
+MOST_OTHER_NS = 10 * SECOND_NS
 """A camera that sends pictures of another size or format for longer does not return to those of the start."""
 QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
 _IDLE_S = 1.0
@@ -150,7 +150,7 @@ class CodedLiveSource(LiveSource):
             self._other_since_ns = None
             return
         self._other_since_ns = self._other_since_ns or now_ns
-        if now_ns - self._other_since_ns > _MOST_OTHER_NS:
+        if now_ns - self._other_since_ns > MOST_OTHER_NS:
             raise FlightError(
                 f"source {self._grabber.name} has changed ({decoder.trouble}), and --encoder passthrough sends what"
                 " it began with: start the edge again"

@@ -305,7 +305,7 @@ def test_a_picture_size_that_changes_within_the_first_connection_is_told_of(unit
 
 def test_a_camera_that_stays_with_another_size_ends_the_flight(units, tmp_path, monkeypatch):
     """The edge went on without a picture for ever, though a new start would have taken the camera as it is now."""
-    monkeypatch.setattr(coded_live, "_MOST_OTHER_NS", 4 * 10**8)
+    monkeypatch.setattr(coded_live, "MOST_OTHER_NS", 4 * 10**8)
     turned = packets_of(write_clip(tmp_path / "a.hevc", hard_pictures(25, size=(384, 256)), fps=25))
     grabber = Turning([*units, *units, *turned])
     settings = SourceSettings(size=lambda size: size, fps=15)
