@@ -19,30 +19,11 @@ from hvt_edge.config import EdgeConfig, check
 from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from media.pictures import write_scene
+from rigs.world import PassedOn
 
 pytestmark = pytest.mark.integration
 
 FPS, READING_S, FRAMES = 15.0, 0.5, 8
-
-
-class SlowSource(Source):
-    """Takes its time for each frame of another."""
-
-    live = False
-
-    def __init__(self, inner: Source) -> None:
-        self._inner = inner
-        self.view, self.fps, self.frame_count = inner.view, inner.fps, inner.frame_count
-
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """See there."""
-        for frame in self._inner.frames(start_ns=start_ns):
-            time.sleep(READING_S)
-            yield frame
-
-    def close(self) -> None:
-        """See there."""
-        self._inner.close()
 
 
 class SlowWorld(World):
@@ -50,7 +31,7 @@ class SlowWorld(World):
 
     def open_source(self, config: EdgeConfig) -> Source:
         """See there."""
-        return SlowSource(super().open_source(config))
+        return PassedOn(super().open_source(config), before=lambda _frame: time.sleep(READING_S))
 
 
 def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path):
@@ -133,7 +114,7 @@ class FragileDetector(Detector):
         return Detections.none()
 
 
-class EndlessSource(SlowSource):
+class EndlessSource(PassedOn):
     """The first frame of another, again and again."""
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
@@ -154,7 +135,7 @@ class FragileWorld(World):
 
     def open_source(self, config: EdgeConfig) -> Source:
         """See there."""
-        return EndlessSource(super().open_source(config))
+        return EndlessSource(super().open_source(config), before=lambda _frame: None)
 
     def open_detector(self, config: EdgeConfig) -> Detector:
         """See there."""

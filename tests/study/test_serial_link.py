@@ -28,25 +28,22 @@ def test_a_message_takes_its_bits_over_the_rate():
     assert link.arrived(None) == []
 
 
-def test_the_base_goes_first_but_interrupts_nothing():
-    """A still that has begun to go holds up the next frame; one that waits does not."""
+@pytest.mark.parametrize(
+    ("messages", "arrivals"),
+    [
+        (
+            [("still 1", 500, 0, False), ("still 2", 500, 1, False), ("frame", 100, 20, True)],
+            [("still 1", 50), ("frame", 60), ("still 2", 110)],
+        ),
+        ([("late", 100, 500, False), ("early", 100, 100, False)], [("early", 110), ("late", 510)]),
+    ],
+)
+def test_the_base_goes_first_but_interrupts_nothing_and_nothing_goes_ahead_of_time(messages, arrivals):
+    """A still that has begun to go holds up the next frame, one that waits does not; before it is there none goes."""
     link = link_of()
-    link.put("still 1", size_bytes=500, enter_ns=0, urgent=False)
-    link.put("still 2", size_bytes=500, enter_ns=1 * MS, urgent=False)
-    link.put("frame", size_bytes=100, enter_ns=20 * MS, urgent=True)
-    there = [(one.message, one.arrival_ns // MS) for one in link.arrived(None)]
-    assert there == [("still 1", 50), ("frame", 60), ("still 2", 110)]
-
-
-def test_it_idles_until_a_message_comes():
-    """A link that worked ahead of time would deliver before the capture."""
-    link = link_of()
-    link.put("late", size_bytes=100, enter_ns=500 * MS, urgent=False)
-    link.put("early", size_bytes=100, enter_ns=100 * MS, urgent=False)
-    assert [(one.message, one.arrival_ns // MS) for one in link.arrived(None)] == [
-        ("early", 110),
-        ("late", 510),
-    ]
+    for name, size_bytes, enter_ms, urgent in messages:
+        link.put(name, size_bytes=size_bytes, enter_ns=enter_ms * MS, urgent=urgent)
+    assert [(one.message, one.arrival_ns // MS) for one in link.arrived(None)] == arrivals
 
 
 def test_what_is_put_later_may_still_overtake_what_has_not_begun():

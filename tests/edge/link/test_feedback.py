@@ -9,22 +9,14 @@ from hvt_common.protocol.messages import Feedback, StillResult
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.perception.shadow import Detected
 from rigs.footprint import footprint_bytes
-from rigs.messages import counted, feedback
+from rigs.messages import RESULT, counted, feedback
 
 U32 = 2**32 - 1
 
 
 def result(sequence: int, *, track: int = 1, name: str = "car", again: bool = False) -> StillResult:
     """One still's class."""
-    return StillResult(
-        still_sequence=sequence,
-        track_id=track,
-        class_name=name,
-        confidence=0.9,
-        entropy_nats=0.1,
-        ground_track_id=-1,
-        again=again,
-    )
+    return replace(RESULT, still_sequence=sequence, track_id=track, class_name=name, again=again)
 
 
 def report(*stills: StillResult, frame: int = -1, base: int = 0, roi: int = 0, receiver: int = 1) -> Feedback:

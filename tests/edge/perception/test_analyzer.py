@@ -15,7 +15,6 @@ import pytest
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.ledger import Ledger
-from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
@@ -32,6 +31,7 @@ from hvt_edge.wiring.perception import make_analyzer
 from media.clips import framed, smooth_pictures
 from programs.processes import PATIENT_S, eventually
 from rigs.flight import CLASSES, SIZE, NothingSeen, RedSquares, square_box
+from rigs.messages import RESULT
 from rigs.world import Puts, make_still_stage, make_transmitter
 
 NOISE = (
@@ -347,22 +347,11 @@ def test_what_the_ground_says_counts_and_no_opinion_does_not():
     """M3 and M5 would never learn what the classifier sees."""
     rig = Rig()
     rig.run(6)
-    answer = {
-        "still_sequence": 0,
-        "track_id": 1,
-        "confidence": 0.9,
-        "entropy_nats": 0.2,
-        "ground_track_id": 3,
-        "again": False,
-    }
-    rig.stage.on_results([StillResult(class_name="", **answer)])
+    answer = replace(RESULT, still_sequence=0, track_id=1)
+    rig.stage.on_results([replace(answer, class_name="")])
     assert rig.class_of_track() is None
-    rig.stage.on_results(
-        [
-            StillResult(class_name="bus", **answer),
-            StillResult(class_name="bus", **(answer | {"track_id": 99})),
-        ]
-    )
+    bus = replace(answer, class_name="bus")
+    rig.stage.on_results([bus, replace(bus, track_id=99)])
     assert rig.class_of_track() == "bus"
 
 

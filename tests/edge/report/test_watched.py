@@ -7,13 +7,12 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from hvt_common.inference.detect import Detector
-from hvt_common.values import Detections, Frame, Image
+from hvt_common.values import Detections, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.source.contract import Source
@@ -21,6 +20,7 @@ from hvt_edge.world import World
 from programs.processes import Link, eventually, free_ports
 from programs.rtsp_camera import RtspCamera
 from rigs.watched_flight import SMALL, STORE_BYTES, asked, series, state, status
+from rigs.world import PassedOn
 
 pytestmark = pytest.mark.integration
 
@@ -83,30 +83,8 @@ def test_a_camera_that_went_away_is_no_dead_process_and_is_said(tmp_path, addres
             eventually(lambda: asked(address, "/readyz")[0] == 200, what="pictures come again")
 
 
-class Hanging(Source):
-    """Gives some frames of another, and then never one again."""
-
-    live = False
-
-    def __init__(self, inner: Source, end: threading.Event) -> None:
-        self._inner, self._end = inner, end
-        self.view, self.fps, self.frame_count = inner.view, inner.fps, inner.frame_count
-
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """See there."""
-        for frame in self._inner.frames(start_ns=start_ns):
-            if frame.index == 10:
-                self._end.wait()
-                return
-            yield frame
-
-    def close(self) -> None:
-        """See there."""
-        self._inner.close()
-
-
 class HangingWorld(World):
-    """With such a source."""
+    """Whose source gives some frames, and then never one again."""
 
     def __init__(self, end: threading.Event) -> None:
         super().__init__()
@@ -114,7 +92,9 @@ class HangingWorld(World):
 
     def open_source(self, config: EdgeConfig) -> Source:
         """See there."""
-        return Hanging(super().open_source(config), self._end)
+        return PassedOn(
+            super().open_source(config), before=lambda frame: frame.index == 10 and self._end.wait()
+        )
 
 
 def test_a_loop_that_hangs_tells_nobody_that_it_lives(tmp_path, address, free_port, monkeypatch, long_scene):

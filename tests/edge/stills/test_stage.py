@@ -36,6 +36,7 @@ from media.base_coded import StandIn
 from media.clips import framed, smooth_pictures
 from programs.processes import PATIENT_S, eventually
 from rigs.flight import CLASSES, SIZE, RedSquares, square_box
+from rigs.messages import RESULT
 from rigs.world import Puts, make_still_stage, make_transmitter
 
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
@@ -106,15 +107,7 @@ def decoded_bases() -> list[YuvPicture]:
 
 def answer(sequence: int, *, again: bool) -> StillResult:
     """What a ground says of a still that it could not show."""
-    return StillResult(
-        still_sequence=sequence,
-        track_id=1,
-        class_name="",
-        confidence=0.0,
-        entropy_nats=0.0,
-        ground_track_id=-1,
-        again=again,
-    )
+    return replace(RESULT, still_sequence=sequence, class_name="", again=again)
 
 
 def test_what_the_edge_builds_on_is_what_the_ground_decodes():

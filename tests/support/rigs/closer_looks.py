@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +22,7 @@ from hvt_edge.link.publisher import Answers
 from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from media.clips import START_NS
+from rigs.world import PassedOn
 
 
 class _StandingClock(SteadyClock):
@@ -92,7 +93,7 @@ class LookFlight(World):
         """The source, with requests between its frames."""
         inner = super().open_source(config) if self.open is None else self.open(config)
         self.view = inner.view
-        return _Asking(inner, self)
+        return PassedOn(inner, before=self.before)
 
     def open_link(self, stack: Any, config: EdgeConfig) -> Any:
         """This is the link too."""
@@ -175,22 +176,3 @@ class LookFlight(World):
         config = EdgeConfig(pace="lockstep", edge_id="uav-1", quiet=True, wait=0.0, **self.settings)
         config = check(with_profile(config, given=set(self.settings)))
         return Edge(config, stop=threading.Event(), world=self).run()
-
-
-class _Asking(Source):
-    """Another source; before each frame the flight may ask."""
-
-    live = False
-
-    def __init__(self, inner: Source, flight: LookFlight) -> None:
-        self._inner, self._flight = inner, flight
-        self.view, self.fps, self.frame_count = inner.view, inner.fps, inner.frame_count
-        self.camera_stream = inner.camera_stream
-
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        for frame in self._inner.frames(start_ns=start_ns):
-            self._flight.before(frame)
-            yield frame
-
-    def close(self) -> None:
-        self._inner.close()

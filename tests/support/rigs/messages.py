@@ -177,6 +177,15 @@ _SILENT = Feedback(
     stills=(),
     backlog=(),
 )
+RESULT = StillResult(
+    still_sequence=4,
+    track_id=57,
+    class_name="minivan",
+    confidence=0.9,
+    entropy_nats=0.25,
+    ground_track_id=12,
+    again=False,
+)
 FEEDBACK = replace(
     _SILENT,
     receiver_id=U64,
@@ -186,17 +195,7 @@ FEEDBACK = replace(
     base_held_us=66_000,
     missing_stills=(3, 7),
     clock_offset_ns=-I63,
-    stills=(
-        StillResult(
-            still_sequence=4,
-            track_id=57,
-            class_name="minivan",
-            confidence=0.9,
-            entropy_nats=0.25,
-            ground_track_id=12,
-            again=False,
-        ),
-    ),
+    stills=(RESULT,),
     backlog=(AcknowledgedRange(session_id=U64, kind="base", number=450, acknowledged_bytes=12_000),),
     objects_detected=214,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,7 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader, RoiHeader
 from hvt_common.runtime.failures import Failures
-from hvt_common.values import View
+from hvt_common.values import Frame, View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
@@ -20,6 +21,7 @@ from hvt_edge.operating import Keyframes, Operating
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing
+from hvt_edge.source.contract import Source
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
@@ -144,3 +146,23 @@ def make_still_stage(
         keyframes=keyframes,
         reporter=reporter,
     )
+
+
+class PassedOn(Source):
+    """Another source; ``before`` is called before each frame, and ends it where it says True."""
+
+    live = False
+
+    def __init__(self, inner: Source, *, before: Callable[[Frame], bool | None]) -> None:
+        self._inner, self._before = inner, before
+        self.view, self.fps, self.frame_count = inner.view, inner.fps, inner.frame_count
+        self.camera_stream = inner.camera_stream
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        for frame in self._inner.frames(start_ns=start_ns):
+            if self._before(frame):
+                return
+            yield frame
+
+    def close(self) -> None:
+        self._inner.close()

@@ -50,14 +50,6 @@ def test_place_and_attitude_come_from_the_autopilot(source, send, autopilot, wai
     assert source.trouble == ""
 
 
-def test_the_mount_says_where_the_camera_points(source, send, autopilot, wait_for):
-    """Places would be computed as if the camera looked where the drone flies."""
-    one = autopilot()
-    send(one.place(), one.attitude(), one.mount())
-    pose = wait_for(source, accept=has_camera)
-    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((90, -60), abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("flags", "yaw"),
     [
@@ -77,10 +69,12 @@ def test_the_gimbal_says_which_way_its_yaw_counts(source, send, autopilot, wait_
     assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((yaw, -30), abs=0.01)
 
 
-def test_a_gimbal_that_does_not_know_hides_no_mount(source, send, autopilot, wait_for):
-    """It writes NaN before it has found north, and the mount's direction was left out."""
+@pytest.mark.parametrize("gimbals", [0, 1])
+def test_the_mount_speaks_where_no_gimbal_knows_better(source, send, autopilot, wait_for, gimbals):
+    """A gimbal writes NaN before it has found north, and the camera would be taken to look where the drone flies."""
     one = autopilot()
-    send(one.place(), one.attitude(50), one.gimbal(math.nan, -30, flags=32), one.mount())
+    unsure = [one.gimbal(math.nan, -30, flags=32)] * gimbals
+    send(one.place(), one.attitude(50), *unsure, one.mount())
     pose = wait_for(source, accept=has_camera)
     assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((60, -60), abs=0.01)
 
