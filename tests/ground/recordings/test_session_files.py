@@ -19,22 +19,15 @@ from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Vi
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.rerun.live_view import viewer_program
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import SLOTS
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
-from programs.rrd import Recording
+from programs import rrd
+from programs.rrd import Recording, settings
 
 FRAMES, KEYINT, TRACKS = 100, 10, 6
 SPLIT = Limit(seconds=2.0)
 STARTS = [0, 30, 60, 90]
 """The keyframes at which a file's two seconds of fifteen frames are up."""
-
-
-def settings(path: Path, **changes: object) -> RecorderSettings:
-    """Of a small session."""
-    return replace(
-        RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0, {"method": "M5"}), **changes
-    )
 
 
 @pytest.fixture(scope="module")
@@ -79,11 +72,7 @@ def parts(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> list
 @pytest.fixture(scope="module")
 def whole(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The same in one."""
-    path = tmp_path_factory.mktemp("whole") / "flight.rrd"
-    with Recorder(settings(path)) as recorder:
-        for event in events:
-            recorder.log(event)
-    return Recording(path)
+    return Recording(rrd.recorded(tmp_path_factory.mktemp("whole") / "flight.rrd", events))
 
 
 def test_names_sort_and_the_video_is_continuous(parts: list[Path], whole: Recording) -> None:

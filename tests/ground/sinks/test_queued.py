@@ -7,7 +7,6 @@ import signal
 import time
 import weakref
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -18,10 +17,10 @@ from hvt_ground.sinks import Outputs, QueuedSink
 from hvt_ground.sinks.line_file import LineFile
 from hvt_ground.sinks.queued import SinkWriter
 from hvt_ground.sinks.rerun.live_view import LiveView, listening
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
 from programs.processes import eventually, free_ports
-from programs.rrd import Recording
+from programs.rrd import Recording, settings
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +28,6 @@ def samples() -> list[VideoSample]:
     """Three seconds of real x265 access units, a keyframe every 20."""
     units = coded(drawn_frames(45), kbps=300, keyint=20)
     return [VideoSample(i, START_NS + i * STEP_NS, *unit) for i, unit in enumerate(units)]
-
-
-def settings(path: Path | None, **changes: object) -> RecorderSettings:
-    """A small recording."""
-    return RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0, **changes)
 
 
 def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import warnings
 from bisect import bisect_right
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from rerun.chunk import Chunk, RrdReader
+
+from hvt_ground.events import Event
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 
 STATIC = -(1 << 62)
 
@@ -30,6 +33,20 @@ class ReadBox:
     doubted: bool = False
     word: str = ""
     """What the viewer calls it."""
+
+
+def settings(path: Path | None, **changes: Any) -> RecorderSettings:
+    """Of a small recording."""
+    small = RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0, {"method": "M5"})
+    return replace(small, **changes)
+
+
+def recorded(path: Path, events: Iterable[Event], **changes: Any) -> Path:
+    """A recording of these."""
+    with Recorder(settings(path, **changes)) as recorder:
+        for event in events:
+            recorder.log(event)
+    return path
 
 
 def damaged(data: bytes, word: bytes, *, at: int = 0, by: bytes = b"\xff" * 40) -> bytes:

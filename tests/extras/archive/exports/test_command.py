@@ -35,9 +35,9 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.palette import GREY, SKY
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
-from programs.rrd import Recording, damaged, ends_its_reader
+from programs.rrd import Recording, damaged, ends_its_reader, recorded, settings
 from programs.small_disk import small_disk
 
 FRAMES, SIZE, TRACKS = 60, (320, 192), 6
@@ -55,11 +55,7 @@ def events() -> list[Event]:
 @pytest.fixture(scope="module")
 def recording(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As the ground writes it."""
-    path = tmp_path_factory.mktemp("flight") / "flight.rrd"
-    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
-        for event in events:
-            recorder.log(event)
-    return path
+    return recorded(tmp_path_factory.mktemp("flight") / "flight.rrd", events)
 
 
 def export(recording: Path, out: Path, *words: str) -> Path:
@@ -114,7 +110,7 @@ def test_an_mp4_is_what_apple_plays_where_that_can_be(tmp_path, sizes, tag):
     """It would not open; or, with parameter sets that changed on the way, break off there."""
     units = [unit for size in sizes for unit, _ in coded(drawn_frames(20, size), kbps=300, keyint=20)]
     path = tmp_path / "flight.rrd"
-    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+    with Recorder(settings(path)) as recorder:
         for index, unit in enumerate(units):
             recorder.log(VideoSample(index, START_NS + index * STEP_NS, unit, keyframe=index % 20 == 0))
     with av.open(str(export(path, tmp_path / "flight.mp4"))) as video:
@@ -192,11 +188,8 @@ def test_an_export_says_how_many_stills_came_beyond_those_it_has(recording, even
     assert "does not hold" not in capsys.readouterr().out
     still = next(one for one in events if isinstance(one, Refinement))
     noise = np.random.default_rng(7).integers(0, 255, (400, 400, 3), np.uint8)  # as JPEG far more than came
-    path = tmp_path / "short.rrd"
-    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
-        for event in [*events, replace(still, still_sequence=9999, media_type="image/webp", still_bgr=noise)]:
-            recorder.log(event)
-    export(path, tmp_path / "short.csv")
+    more = replace(still, still_sequence=9999, media_type="image/webp", still_bgr=noise)
+    export(recorded(tmp_path / "short.rrd", [*events, more]), tmp_path / "short.csv")
     assert "stills; 1 more came whose pictures the recording does not hold" in capsys.readouterr().out
 
 
@@ -225,23 +218,20 @@ def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
 )
 def test_what_is_a_guess_has_the_same_word_in_each_picture(field, word, colour, events, tmp_path):
     """A guess of an unknown view bore its class in Foxglove and in the video, and none on the page."""
-    settings = RecorderSettings(tmp_path / "unknown.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
     guesses: list[Overlay] = []
     for one in (one for one in events if isinstance(one, Overlay)):
         guess: dict[str, Any] = {field: np.ones(len(one.track_ids), np.bool_)}
         guesses.append(replace(one, **guess))
     video: list[Event] = [one for one in events[:8] if isinstance(one, VideoSample)]
-    with Recorder(settings) as recorder:
-        for event in (*video, *guesses[:8]):
-            recorder.log(event)
-    with export(settings.path, tmp_path / "unknown.mcap").open("rb") as file:
+    path = recorded(tmp_path / "unknown.rrd", (*video, *guesses[:8]))
+    with export(path, tmp_path / "unknown.mcap").open("rb") as file:
         drawn = [
             ImageAnnotations.FromString(message.data)
             for _, channel, message in make_reader(file).iter_messages()
             if channel.topic == "/uav-1/tracks"
         ]
     words = {text.text.split()[1] for one in drawn for text in one.texts}
-    assert words == {word} == {box.word for box in Recording(settings.path).boxes(4).values()}
+    assert words == {word} == {box.word for box in Recording(path).boxes(4).values()}
     colours = {
         (box.outline_color.r, box.outline_color.g, box.outline_color.b) for one in drawn for box in one.points
     }
@@ -256,8 +246,7 @@ def test_a_ground_that_was_started_again_leaves_no_ghosts(events, tmp_path):
     halves = (0, 30), (30, 60)
     boats = ("boat",) * TRACKS
     for number, (begin, end) in enumerate(halves):
-        settings = RecorderSettings(tmp_path / f"{number}.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
-        with Recorder(settings) as recorder:
+        with Recorder(settings(tmp_path / f"{number}.rrd")) as recorder:
             for event in events:
                 if begin <= event.frame_index < end and not isinstance(event, Refinement):
                     shift = (
@@ -311,7 +300,7 @@ def test_pictures_that_need_a_lost_one_are_not_exported(tmp_path, caplog):
     """They counted as exported, and players showed smears or nothing."""
     path, live = tmp_path / "flight.rrd", tmp_path / "live.rrd"
     drawn = drawn_frames(FRAMES, SIZE)
-    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+    with Recorder(settings(path)) as recorder:
         for frame, (unit, _) in enumerate(coded(drawn, kbps=200, keyint=20)):
             recorder.log(VideoSample(frame, START_NS + frame * STEP_NS, unit, keyframe=frame % 20 == 0))
         shutil.copy(path, live)
@@ -341,8 +330,7 @@ def test_a_recording_that_ends_the_process_of_its_reader_is_exported(recording, 
 
 def test_a_split_session_is_exported_as_one(recording, events, tmp_path):
     """A video would end where a file did."""
-    settings = RecorderSettings(tmp_path / "part.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
-    sink = SessionFiles(settings, split=Limit(seconds=1.2))
+    sink = SessionFiles(settings(tmp_path / "part.rrd"), split=Limit(seconds=1.2))
     for event in events:
         sink.log(event)
     sink.close()
@@ -387,7 +375,7 @@ def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
         capsys, recording, "--to", "csv", "--burn-in"
     )
     other = tmp_path / "other.rrd"
-    with Recorder(RecorderSettings(other, "uav-2", "0aaa", SIZE, 15.0, 500_000.0)):
+    with Recorder(settings(other, edge_id="uav-2", session="0aaa")):
         pass
     assert "are of 2 sessions" in refused(capsys, recording, other, "--to", "mp4")
     assert "recording of uav-2 has no video" in refused(capsys, other, "--to", "mp4")

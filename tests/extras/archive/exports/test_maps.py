@@ -21,8 +21,9 @@ from hvt_common.geodesy import metres_per_degree
 from hvt_common.values import Orientation, Pose, View
 from hvt_geo.camera import places_of_boxes
 from hvt_ground.events import Overlay, PoseUpdate
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
+from programs import rrd
 from programs.rrd import Recording
 
 pytestmark = pytest.mark.filterwarnings(
@@ -55,7 +56,7 @@ def pose_at(frame: int, *, start_deg: float = 8.5, speed_mps: float = 8.0) -> Po
 def recorded(path: Path, **way: float) -> Path:
     """As the ground writes it, with a pose a second."""
     drawn = drawn_frames(FRAMES, SIZE)
-    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+    with Recorder(rrd.settings(path)) as recorder:
         for event, _ in session(drawn, coded(drawn, kbps=300, keyint=20), tracks=TRACKS, total_kbps=500):
             if isinstance(event, Overlay):
                 frame = event.frame_index
@@ -91,11 +92,8 @@ def hovering(tmp_path_factory) -> Path:
 def bare(tmp_path_factory) -> Path:
     """A flight without a pose."""
     drawn = drawn_frames(20, SIZE)
-    path = tmp_path_factory.mktemp("bare") / "flight.rrd"
-    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
-        for event, _ in session(drawn, coded(drawn, kbps=300), tracks=2, total_kbps=500):
-            recorder.log(event)
-    return path
+    events = session(drawn, coded(drawn, kbps=300), tracks=2, total_kbps=500)
+    return rrd.recorded(tmp_path_factory.mktemp("bare") / "flight.rrd", (event for event, _ in events))
 
 
 def export(recording: Path, out: Path) -> Path:

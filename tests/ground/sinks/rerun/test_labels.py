@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from hvt_ground.events import Overlay
 from hvt_ground.sinks.rerun.labels import Word, place_labels, place_legend
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import Gallery
+from programs import rrd
 from programs.rrd import Recording
 from rigs.examples import refinement
 
@@ -76,13 +76,7 @@ def test_the_legend_is_below_the_picture_and_does_not_collide():
 
 def recorded(path: Path, *events) -> Recording:
     """A recording of these."""
-    settings = RecorderSettings(
-        path=path, edge_id="uav-1", session="00ff", base_size=SIZE, fps=15.0, budget_bps=4e5
-    )
-    with Recorder(settings) as recorder:
-        for event in events:
-            recorder.log(event)
-    return Recording(path)
+    return Recording(rrd.recorded(path, events, base_size=SIZE))
 
 
 def overlay(frame: int = 0, **changes) -> Overlay:

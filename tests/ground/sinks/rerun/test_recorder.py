@@ -22,29 +22,15 @@ from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.rerun import recorder as recorder_module
 from hvt_ground.sinks.rerun.live_view import LiveView, free_port, viewer_program
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS, Gallery, frame_of, placed
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
-from programs.rrd import Recording
+from programs.rrd import Recording, recorded, settings
 from rigs import examples
 
 SIZE = (320, 192)
 FRAMES = 45
 TRACKS = 12
-
-
-def settings(path: Path | None, **changes: object) -> RecorderSettings:
-    """Settings of a small recording."""
-    values = {
-        "path": path,
-        "edge_id": "uav-1",
-        "session": "00ff",
-        "base_size": SIZE,
-        "fps": 15.0,
-        "budget_bps": 400_000.0,
-        "facts": {"method": "M5"},
-    }
-    return RecorderSettings(**(values | changes))
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +53,7 @@ def of(kind: type, events: list[Event]) -> list:
 @pytest.fixture(scope="module")
 def recording(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The session, recorded and read back."""
-    path = tmp_path_factory.mktemp("rrd") / "flight.rrd"
-    with Recorder(settings(path)) as recorder:
-        for event in events:
-            recorder.log(event)
-    return Recording(path)
+    return Recording(recorded(tmp_path_factory.mktemp("rrd") / "flight.rrd", events))
 
 
 def test_the_video_is_the_stream_as_received(recording: Recording, events: list[Event]) -> None:

@@ -13,18 +13,11 @@ import pytest
 
 from hvt_ground.events import Overlay, Refinement, VideoSample
 from hvt_ground.sinks.rerun.overlays import ORIGINS, REPORTED_MARK
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.rerun.still_places import FRESH_NS, PATCHES, Moved, Patches, Placement
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
-from programs.rrd import Recording
+from programs.rrd import Recording, settings
 from rigs.examples import overlay, refinement
-
-
-def settings(path: Path) -> RecorderSettings:
-    """Settings of a small recording."""
-    return RecorderSettings(
-        path=path, edge_id="uav-1", session="1", base_size=(320, 192), fps=15.0, budget_bps=400_000.0
-    )
 
 
 def _overlay(frame: int, boxes: Sequence[np.ndarray], ids: Sequence[int]) -> Overlay:
