@@ -51,6 +51,13 @@ def _plain(text: str, *, name: str) -> str:
     return text
 
 
+def _place(text: str, *, name: str) -> str:
+    # No shell makes a folder of the ``~`` in --source=~/clip.mp4, nor in a file of settings.
+    return (
+        str(Path(_plain(text, name=name)).expanduser()) if text.startswith("~/") else _plain(text, name=name)
+    )
+
+
 def _path(text: str, *, name: str) -> Path:
     path = named_path(_plain(text, name=name), name=name)
     _plain(str(path), name=name)  # a blank with a slash behind it is a blank
@@ -63,6 +70,8 @@ def _decimal(number: float) -> str:
 
 
 TEXT = SettingType("TEXT", _plain)
+PLACE = SettingType("TEXT", _place)
+"""A path, or a word or an address in its place."""
 PATH = SettingType("FILE", _path)
 BITRATE = SettingType("RATE", parse_bitrate, lambda bps: f"{_decimal(bps / 1000)}kbps")
 BYTES = SettingType("SIZE", parse_bytes, lambda size: f"{_decimal(size / 1_000_000)}MB")

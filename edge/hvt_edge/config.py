@@ -14,6 +14,7 @@ from hvt_common.config import (
     BYTES,
     DURATION,
     PATH,
+    PLACE,
     SHARE,
     SIZE,
     TEXT,
@@ -77,7 +78,7 @@ class EdgeConfig:
     """The settings of ``hvt-edge``. See ``--help-all`` for each."""
 
     source: str | None = _SOURCE.option(
-        TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0, demo or demo:codes,4k"
+        PLACE, None, "clip.mp4, folder/, rtsp://…, /dev/video0, demo or demo:codes,4k"
     )
     edge_id: str = _SOURCE.option(TEXT, "edge-1", "name of this edge: 1 to 32 of a-z, 0-9 and -")
     size: tuple[int, int] | str | None = _SOURCE.option(
@@ -101,7 +102,7 @@ class EdgeConfig:
         "wait for a video file that still grows; it ends when it has not for 10 s"
     )
     pose: str | None = _SOURCE.option(
-        TEXT,
+        PLACE,
         None,
         "where the camera is: FILE.csv, .srt (DJI), .gpx, fixed:LAT,LON,HEIGHT,AZIMUTH,TILT or mavlink:…",
     )

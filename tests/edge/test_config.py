@@ -126,6 +126,13 @@ def test_a_budget_whose_window_holds_no_keyframe_is_refused_with_the_least_that_
         settled(*argv, "--budget", f"{least_bps / 1000 - 2:.0f}kbps")
 
 
+@pytest.mark.parametrize("option", ["source", "pose"])
+def test_the_users_own_folder_may_be_written_short(option, monkeypatch, tmp_path):
+    """No shell makes one of --source=~/clip.mp4, and the edge looked for a folder of the name ~."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert getattr(read(f"--{option}=~/flight"), option) == str(tmp_path / "flight")
+
+
 def test_the_short_help_is_short_and_grouped(capsys):
     """A first reader would look for --budget among sixty settings."""
     with pytest.raises(SystemExit):

@@ -66,6 +66,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         return DemoSource(spec, settings, seed=seed)
     scheme = "" if is_local(spec) else spec.partition("://")[0].lower()
     if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
+        _check_port(spec, scheme)
         stream = (CodedStreamGrabber if coded else StreamGrabber)(spec, read_s=patience_s(fps))
         stream.open()
         if isinstance(stream, CodedStreamGrabber) and not stream.holds_a_clip:
@@ -83,6 +84,14 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     if not scheme and Path(spec).is_dir():
         return FolderSource(spec, settings)
     return VideoSource(spec, settings)
+
+
+def _check_port(spec: str, scheme: str) -> None:
+    # FFmpeg waits for ever at a port that there is not.
+    address = re.split(r"[/?]", spec.partition("://")[2])[0]
+    port = re.fullmatch(r".*:([0-9]{1,5})", address)
+    if scheme in {"udp", "rtp", "tcp"} and not (port and 0 < int(port[1]) < 2**16):
+        raise UserError(f"source {shown(spec)!r} names no port: give {scheme}://HOST:PORT, 1 to 65535")
 
 
 def _check_there(spec: str, scheme: str, *, growing: bool) -> None:

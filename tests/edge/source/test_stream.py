@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pytest
 
-from hvt_common.errors import NotYetError
+from hvt_common.errors import NotYetError, UserError
 from hvt_edge.source import stream
 from hvt_edge.source.coded_live import CodedStreamGrabber
 from hvt_edge.source.live import SignalLost
@@ -64,7 +64,7 @@ def test_a_camera_that_is_as_slow_as_was_asked_is_not_gone(monkeypatch, fps, wai
 
     monkeypatch.setattr(av, "open", away)
     with pytest.raises(NotYetError):
-        open_source("tcp://camera", size=(320, 180), fps=fps, coded=coded)
+        open_source("tcp://camera:554", size=(320, 180), fps=fps, coded=coded)
     assert waited == [pytest.approx(waits_s)]
 
 
@@ -79,3 +79,12 @@ def test_a_camera_has_as_long_when_it_is_opened_again(monkeypatch):
     camera.restart()
     camera.close()
     assert opened == [(10, 7)] * 2
+
+
+@pytest.mark.parametrize(
+    "address", ["udp://5600", "udp://:5600x", "udp://0.0.0.0:99999", "rtp://[::1]", "tcp://a"]
+)
+def test_a_stream_without_a_port_is_refused(address):
+    """FFmpeg took 99999 or no number at all for a port, and the edge waited for ever where nobody could send."""
+    with pytest.raises(UserError, match="names no port: give"):
+        open_source(address, size=(320, 180), fps=15)
