@@ -286,11 +286,3 @@ def test_a_name_that_is_taken_is_refused(packages):
         still_codec("jpeg")
     assert still_codec_names().count("jpeg") == 1
     assert still_codec("residual").name == "residual"
-
-
-def test_two_packages_of_one_name_are_refused(packages):
-    """Which of the two codes the stills would depend on the order of the path."""
-    for module in ("acme_codecs", "acme_other"):
-        packages({"acme-pixels": "PixelCodec"}, module=module)
-    with pytest.raises(UserError, match="comes from both package acme_"):
-        still_codec("acme-pixels")

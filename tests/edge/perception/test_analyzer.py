@@ -111,29 +111,22 @@ def test_what_nobody_uses_is_not_searched_and_goes_on_from_any_frame():
     assert seen.tracks.ids.tolist() == expected.tracks.ids.tolist()
 
 
-def test_a_picture_is_converted_where_somebody_looks_at_it(monkeypatch):
+@pytest.mark.parametrize("candidates", ["source", "decoded"])
+def test_a_picture_is_converted_where_somebody_looks_at_it(monkeypatch, candidates):
     """Each coded frame would be converted for the one in five that is searched, a twentieth of all work."""
     converted = []
     convert = YuvPicture.bgr
     monkeypatch.setattr(YuvPicture, "bgr", lambda self: converted.append(1) or convert(self))
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
-    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, detect_every=5, candidates="source")
+    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, detect_every=5, candidates=candidates)
+    found = 0
     for frame, unit in zip(FRAMES, UNITS, strict=True):
         seen = analyzer.analyze(frame, unit)
         if seen.detected:
+            found += 1
             assert seen.base_bgr is seen.base_bgr, "once"
         assert seen.base is not None
-    assert len(converted) == 6
-
-
-def test_of_the_decoded_stream_only_what_is_searched_is_converted(monkeypatch):
-    """A conversion takes longer than decoding."""
-    converted = []
-    convert = YuvPicture.bgr
-    monkeypatch.setattr(YuvPicture, "bgr", lambda self: converted.append(1) or convert(self))
-    analyzer = make(detect_every=5)
-    seen = [analyzer.analyze(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
-    assert len(converted) == sum(one.detected for one in seen) == 6
+    assert len(converted) == found == 6
 
 
 def test_in_a_hurry_detection_is_put_off_and_made_up_for():
