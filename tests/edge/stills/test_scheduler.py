@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -345,7 +344,7 @@ def test_a_lost_still_that_is_not_allowed_holds_up_nobody():
     rig = LossRig()
     rig.lose((50, 9.0, 9_000))
     rig.consider({1: SMALL})
-    assert rig.sent_tracks(8_000) == [(1, 1.0)]
+    assert rig.sent_tracks(8_999) == [(1, 1.0)]
     assert rig.sent_tracks(9_000) == [(50, 9.0)]
 
 
@@ -356,16 +355,6 @@ def test_a_lost_still_leaves_precedence_to_a_newer_of_its_track():
     rig.consider({3: SMALL})
     assert rig.sent_tracks(10) == []
     assert rig.sent_tracks()[0] == (3, 3.0)
-
-
-@pytest.mark.parametrize("allowance", [0, 399])
-def test_a_lost_still_keeps_to_the_budget(allowance):
-    """Loss would make the edge spend more than it was given, on a link that has less."""
-    rig = LossRig()
-    rig.lose((50, 9.0, 400))
-    rig.consider({})
-    assert rig.sent_tracks(allowance) == []
-    assert rig.sent_tracks(400) == [(50, 9.0)]
 
 
 def test_what_is_allowed_next_to_nothing_waits_for_an_allowance_that_helps():
