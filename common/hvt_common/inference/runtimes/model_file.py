@@ -59,7 +59,7 @@ def check_onnx_file(path: Path) -> None:
         raise UserError(f"model {path} is not a file; an ONNX file is expected")
     try:
         status = path.stat()
-        _check_file(path, (status.st_ino, status.st_size, status.st_mtime_ns))
+        _check_file(path, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
     except OSError as error:
         raise UserError(f"model {path} cannot be read: {error.strerror}") from error
 
@@ -95,8 +95,8 @@ def _top_fields(path: Path) -> Iterator[tuple[int, int, bytes]]:
 
 
 @functools.lru_cache(maxsize=16)
-def _check_file(path: Path, version: tuple[int, int, int]) -> None:
-    # Once for each ``version`` of a file, of four that ask while a detector is opened.
+def _check_file(path: Path, version: tuple[int, ...]) -> None:
+    # Once for each ``version`` of a file, of four that ask while a detector is opened; its time may be set back.
     size_bytes = version[1]
     if size_bytes > MAX_MODEL_BYTES:
         raise UserError(f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted")

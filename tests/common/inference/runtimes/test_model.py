@@ -115,6 +115,17 @@ def test_a_file_is_gone_through_once_and_again_where_it_is_another(tmp_path: Pat
             model_file.check_onnx_file(path)
 
 
+def test_a_file_that_was_written_over_with_its_old_time_is_another(tmp_path: Path) -> None:
+    """What ``rsync --inplace --times`` left damaged counted as whole, and ended the start with a traceback."""
+    path = constant_model(tmp_path / "model.onnx", np.ones((1, 2)))
+    model_file.check_onnx_file(path)
+    before = path.stat()
+    path.write_bytes(b"\xff" * before.st_size)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    with pytest.raises(UserError, match="cut short"):
+        model_file.onnx_metadata(path)
+
+
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, 10_000), place=st.integers(0, 10_000), byte=st.integers(0, 255))
 def test_damaged_models_are_refused_or_open_but_never_crash(
