@@ -180,9 +180,9 @@ class Ground:
             yet = "not yet " * ("listener" in late)
             line.note(f"hvt-ground: {yet}listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
         for page in filter(None, (view, *pages)):
-            # Until then another program answers there.
-            later = ", once it is free" * (page != view and "web page" in late)
-            line.note(f"hvt-ground: watch at {page}{later}")
+            # Another program may answer there.
+            yet = "not yet, " * (page != view and "web page" in late)
+            line.note(f"hvt-ground: {yet}watch at {page}")
 
     def _serve(
         self,

@@ -321,7 +321,7 @@ def test_a_whole_ground_waits_and_serves(link, scene):
     for part in ("listener", "web page", "metrics"):
         ground.until(f"hvt-ground: {part}: ")
     assert "hvt-ground: not yet listening on" in ground.said
-    ground.until(f"watch at http://{page}/, once it is free")  # another program's page is there now
+    ground.until(f"not yet, watch at http://{page}/")  # another program's page is there now
     for one in holders:
         one.let_go()
     for part in ("listener", "web page", "metrics"):

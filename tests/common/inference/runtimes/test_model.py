@@ -102,6 +102,7 @@ def test_a_file_over_the_cap_is_not_even_parsed(tmp_path: Path) -> None:
 def test_a_file_is_gone_through_once_and_again_where_it_is_another(tmp_path: Path, monkeypatch) -> None:
     """Each start would go through a model four times; or a file that was replaced would count as whole."""
     path, passes = constant_model(tmp_path / "model.onnx", np.ones((1, 2))), []
+    os.utime(path, (1e9, 1e9))
     through = model_file.mmap.mmap
     monkeypatch.setattr(
         model_file.mmap, "mmap", lambda *given, **named: passes.append(1) or through(*given, **named)
@@ -118,6 +119,7 @@ def test_a_file_is_gone_through_once_and_again_where_it_is_another(tmp_path: Pat
 def test_a_file_that_was_written_over_with_its_old_time_is_another(tmp_path: Path) -> None:
     """What ``rsync --inplace --times`` left damaged counted as whole, and ended the start with a traceback."""
     path = constant_model(tmp_path / "model.onnx", np.ones((1, 2)))
+    os.utime(path, (1e9, 1e9))
     model_file.check_onnx_file(path)
     before = path.stat()
     path.write_bytes(b"\xff" * before.st_size)
