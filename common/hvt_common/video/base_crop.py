@@ -8,13 +8,16 @@ to it, and a still has to be closer to the source than it. Of a picture as it wa
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image, View
-from hvt_common.video.hevc import Plane, YuvPicture
+
+if TYPE_CHECKING:  # the command line needs sizes alone, and no PyAV
+    from hvt_common.video.hevc import Plane, YuvPicture
 
 MAX_SIDE_PX = 512
 """A longer crop is coded smaller: an object that fills 512 pixels needs no more to be classified."""
@@ -43,7 +46,7 @@ def base_crop(
     The base gets its best chance: exact sub-pixel alignment, cubic where it is enlarged, area means where it is
     shrunk.
     """
-    if isinstance(picture, YuvPicture):
+    if not isinstance(picture, np.ndarray):
         planes = picture.planes
         if planes is not None:
             return exact_base_crop(planes, view=view, crop_source_px=crop_source_px, size=size)

@@ -461,10 +461,8 @@ def noted(path: Path) -> Iterator[str]:
         elif name in ("Notice", "_notice"):
             yield from spoken(call.args[-1])
     for node in ast.walk(ast.parse(path.read_text())):  # what was put into a name before
-        if isinstance(node, ast.Assign) and path.stem in ("session", "recordings"):
-            yield from (
-                text for text in spoken(node.value) if "left out here" in text or "of this session" in text
-            )
+        if isinstance(node, ast.Assign) and path.stem == "session":
+            yield from (text for text in spoken(node.value) if "left out here" in text)
 
 
 def given(path: Path, names: set[str]) -> Iterator[str]:
