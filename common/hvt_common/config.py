@@ -53,9 +53,7 @@ def _plain(text: str, *, name: str) -> str:
 
 def _place(text: str, *, name: str) -> str:
     # No shell makes a folder of the ``~`` in --source=~/clip.mp4, nor in a file of settings.
-    return (
-        str(Path(_plain(text, name=name)).expanduser()) if text.startswith("~/") else _plain(text, name=name)
-    )
+    return str(_path(text, name=name)) if text.startswith("~/") else _plain(text, name=name)
 
 
 def _path(text: str, *, name: str) -> Path:

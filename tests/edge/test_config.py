@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pwd
 import re
 from pathlib import Path
 
@@ -131,6 +132,15 @@ def test_the_users_own_folder_may_be_written_short(option, monkeypatch, tmp_path
     """No shell makes one of --source=~/clip.mp4, and the edge looked for a folder of the name ~."""
     monkeypatch.setenv("HOME", str(tmp_path))
     assert getattr(read(f"--{option}=~/flight"), option) == str(tmp_path / "flight")
+
+
+@pytest.mark.parametrize("option", ["source", "pose"])
+def test_a_user_without_a_folder_is_told_so(option, monkeypatch):
+    """A container's user may have none, and --source=~/clip.mp4 ended the edge with a traceback."""
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", lambda _: {}["none"])
+    with pytest.raises(UserError, match="'~/flight' begins with a user that this machine does not know"):
+        read(f"--{option}=~/flight")
 
 
 def test_the_short_help_is_short_and_grouped(capsys):

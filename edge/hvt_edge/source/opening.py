@@ -87,9 +87,11 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
 
 
 def _check_port(spec: str, scheme: str) -> None:
-    # FFmpeg waits for ever at a port that there is not.
+    # FFmpeg waits for ever at a port that there is not. By UDP it also listens on ``?localport=``.
     address = re.split(r"[/?]", spec.partition("://")[2])[0]
     port = re.fullmatch(r".*:([0-9]{1,5})", address)
+    if scheme == "udp" and port is None:
+        port = re.search(r"[?&]localport=([0-9]{1,5})(?:&|$)", spec)
     if scheme in {"udp", "rtp", "tcp"} and not (port and 0 < int(port[1]) < 2**16):
         raise UserError(f"source {shown(spec)!r} names no port: give {scheme}://HOST:PORT, 1 to 65535")
 

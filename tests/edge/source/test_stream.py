@@ -88,3 +88,14 @@ def test_a_stream_without_a_port_is_refused(address):
     """FFmpeg took 99999 or no number at all for a port, and the edge waited for ever where nobody could send."""
     with pytest.raises(UserError, match="names no port: give"):
         open_source(address, size=(320, 180), fps=15)
+
+
+def test_a_port_to_listen_on_is_one(monkeypatch):
+    """FFmpeg listens on ?localport= of udp://, and the edge refused the address for want of a port."""
+    opened = []
+    monkeypatch.setattr(StreamGrabber, "open", lambda self: opened.append(self.name) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        open_source("udp://127.0.0.1?pkt_size=1316&localport=5600", size=(320, 180), fps=15)
+    with pytest.raises(UserError, match="names no port: give"):
+        open_source("udp://127.0.0.1?localport=99999", size=(320, 180), fps=15)
+    assert len(opened) == 1
