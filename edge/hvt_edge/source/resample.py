@@ -24,6 +24,9 @@ _log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
+_MOST_SIZES = 4
+"""So many sizes are told of: in a folder of photographs each picture may have one of its own."""
+
 
 def capture_time_ns(index: int, *, fps: Fraction, start_ns: int) -> int:
     """Media time of base frame ``index`` as Unix time in nanoseconds, rounded once."""
@@ -123,7 +126,7 @@ class Resizer:
         return replace(self.frame(picture, index=index, capture_ns=capture_ns), camera_unit=unit)
 
     def _tell_size(self, wide: int, high: int) -> None:
-        if (wide, high) not in self._sizes:
+        if (wide, high) not in self._sizes and len(self._sizes) < _MOST_SIZES:
             self._sizes.add((wide, high))
             first = f"{self.view.source_size[0]}x{self.view.source_size[1]}"
             _log.warning(

@@ -186,6 +186,14 @@ def test_pictures_of_another_size_are_told_of_once(caplog):
     assert said == ["cam: a picture is 640x480", "cam: a picture is 48x64"]
 
 
+def test_not_every_size_is_told(caplog):
+    """A folder of photographs, each of a size of its own, wrote a warning for each."""
+    resizer = Resizer((64, 48), (64, 48), fit="letterbox")
+    for wide in range(64, 96):
+        resizer.frame(np.zeros((48, wide, 3), np.uint8), index=0, capture_ns=0)
+    assert sum("a picture is" in one.message for one in caplog.records) == 3
+
+
 def test_broadcast_rates_are_exact():
     """29.97 typed by a user and 30000/1001 from a container would drift apart from what was meant."""
     assert exact_rate(30000 / 1001) == Fraction(30000, 1001)
