@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import mmap
+import os
 import re
 import time
 from collections.abc import Iterator, Mapping
@@ -51,7 +52,7 @@ _TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 13, 14
 _FIXED_BYTES = {1: 8, 5: 4}
 
 _YOUNG_NS = 2 * SECOND_NS
-"""Within that a file may be written again at the same time: its clock ticks each 10 ms, or each 2 s (FAT)."""
+"""Within that a file may be written again without another time: that is of 10 ms, or of 2 s (FAT)."""
 
 _Bytes = bytes | mmap.mmap
 
@@ -104,13 +105,15 @@ def _top_fields(path: Path) -> Iterator[tuple[int, int, bytes]]:
 @functools.lru_cache(maxsize=16)
 def _check_file(path: Path, version: tuple[int, ...]) -> None:
     # Once for each ``version`` of a file, of four that ask while a detector is opened; its time may be set back.
-    size_bytes = version[1]
-    if size_bytes > MAX_MODEL_BYTES:
-        raise UserError(f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted")
-    if not size_bytes:
-        raise UserError(f"model {path} is not an ONNX file (it is empty)")
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        _check(path, data)
+    del version
+    with path.open("rb") as file:
+        size_bytes = os.fstat(file.fileno()).st_size
+        if size_bytes > MAX_MODEL_BYTES:
+            raise UserError(f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted")
+        if not size_bytes:
+            raise UserError(f"model {path} is not an ONNX file (it is empty)")
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            _check(path, data)
 
 
 def _check(path: Path, data: mmap.mmap) -> None:
