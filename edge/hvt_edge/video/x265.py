@@ -4,8 +4,8 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
 
 * ``strict-cbr`` with a VBV of 0.15 s keeps the run within 1.02 and each rolling second within 1.14 of the target
   from 300 kbps up, on-demand keyframes included. Without it x265 under-spends (0.7 to 0.95 of the target); with
-  0.2 s a keyframe on demand reaches 1.18. A sixth to a quarter of the bytes is x265's filler
-  (docs/design-notes/base-stream.md).
+  0.2 s a keyframe on demand reaches 1.18. Of a still scene 16 to 40 % of the bytes are x265's
+  filler, of a moving one 2 (docs/design-notes/base-stream.md).
 * ``keyint=-1``: no keyframe comes by itself. The edge asks for each one, so that stills can yield to it.
 * ``pools``: with several worker threads the row-level rate control sees a different order of rows each run, and the
   same input gives other bytes. Lockstep therefore uses one; real time uses what there is, which halves the time of a
