@@ -150,6 +150,9 @@ _IRAP = frozenset(range(16, 22))
 """BLA, IDR and CRA pictures of H.265, table 7-1."""
 PARAMETER_SETS = frozenset({32, 33, 34})
 """VPS, SPS and PPS, ibid."""
+_FILLER = 38
+_FILLER_START = b"\0\0\1" + bytes([_FILLER << 1])
+"""A start code stands nowhere else, so this is a unit of filler data."""
 
 
 def nal_units(stream: bytes) -> list[bytes]:
@@ -158,6 +161,13 @@ def nal_units(stream: bytes) -> list[bytes]:
     ends = [*starts, len(stream)][1:]
     found = (stream[begin + 3 : end].rstrip(b"\0") for begin, end in zip(starts, ends, strict=True))
     return [unit for unit in found if unit]
+
+
+def without_filler(access_unit: bytes) -> bytes:
+    """The same picture without filler data: some encoders fill up with it what a still scene leaves of their rate."""
+    if _FILLER_START not in access_unit:
+        return access_unit
+    return b"".join(LONG_START + one for one in nal_units(access_unit) if nal_kind(one) != _FILLER)
 
 
 def parameter_sets(access_unit: bytes) -> bytes:

@@ -21,6 +21,7 @@ from hvt_common.video.hevc import (
     is_keyframe,
     nal_kind,
     nal_units,
+    without_filler,
 )
 from hvt_edge.source.contract import BaseSize, SeenUnit, check_shape
 from hvt_edge.source.decoding.pictures import matrix_of, turn_of
@@ -39,8 +40,9 @@ class CameraUnits:
 
     A file in MP4 or Matroska writes lengths in place of start codes and has its parameter sets once, in a header
     (hvcC, ISO/IEC 14496-15, 8.3.2.1.2); a camera may send them once, in the description of its RTSP stream. A ground
-    that joins later would wait for them for ever. So they are put before each keyframe that comes without; all else
-    stays. ``header`` is the container's or the stream's description before the first packet.
+    that joins later would wait for them for ever. So they are put before each keyframe that comes without. Filler,
+    with which a camera keeps a constant rate, goes; all else stays. ``header`` is the container's or the stream's
+    description before the first packet.
     """
 
     def __init__(self, header: bytes) -> None:
@@ -57,6 +59,7 @@ class CameraUnits:
         data = packet
         if self._length_bytes:
             data = b"".join(LONG_START + one for one in _split(packet, self._length_bytes))
+        data = without_filler(data)
         nals = nal_units(data)
         slices = [one for one in nals if nal_kind(one) < _SLICES_END]
         pictures = sum(len(one) > 2 and bool(one[2] & _FIRST_OF_PICTURE) for one in slices)

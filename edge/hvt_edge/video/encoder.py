@@ -43,6 +43,8 @@ _FRAME_FLOOR_BITS_PER_PX = 0.0045
 # The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
+_VBV_FRAMES = 1.5
+"""At least: with one alone x265 uses .7 of its rate, with 2 the fullest second reaches 1.2."""
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
 _KEYFRAME_EVERY_S = 5.0
 """x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
@@ -66,8 +68,6 @@ class EncoderSettings:
     vbv_s: float = VBV_S
     threads: int = 1
     """Worker threads; more than one is faster, and not the same bytes each run."""
-    side_data: bool = False
-    """Whether `BaseEncoder.encode` takes regions."""
 
 
 def keyframe_floor_bytes(size: tuple[int, int]) -> int:
@@ -129,7 +129,6 @@ def encoder_settings(
     base_bps: int,
     edge_id: str,
     window_s: float = 1.0,
-    side_data: bool = False,
 ) -> EncoderSettings:
     """Settings of x265 that keep the base stream within B_v, and its fullest second within B_tot.
 
@@ -138,7 +137,6 @@ def encoder_settings(
     ``window_s`` holds no whole number of frames, the target is lowered until it holds all that fall into it.
 
     ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds one at least.
-    ``side_data`` is needed by `TrackRegions`.
     """
     tight = base_bps * _PEAK > total_bps
     line_bps = min(base_bps, total_bps / _TIGHT_PEAK) if tight else base_bps
@@ -151,7 +149,6 @@ def encoder_settings(
         bitrate_bps=max(1, round(payload_bps)),
         preset=preset,
         vbv_s=_vbv_s(fps, tight=tight),
-        side_data=side_data,
     )
 
 
@@ -167,7 +164,7 @@ def payload_bps(base_bps: int, *, size: tuple[int, int], fps: float, edge_id: st
 
 
 def _vbv_s(fps: float, *, tight: bool = False) -> float:
-    return max(_TIGHT_VBV_S if tight else VBV_S, 1 / fps)
+    return max(_TIGHT_VBV_S if tight else VBV_S, _VBV_FRAMES / fps)
 
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
@@ -219,13 +216,18 @@ class CheckedEncoder:
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
         """See `Encoder`. The unit itself tells whether it is a keyframe, whatever the encoder says of it."""
-        from hvt_common.video.hevc import is_keyframe, parameter_sets  # noqa: PLC0415  (the command line needs no decoder)
+        from hvt_common.video.hevc import (  # noqa: PLC0415  (the command line needs no decoder)
+            is_keyframe,
+            parameter_sets,
+            without_filler,
+        )
 
         assert not regions, "config.check() refuses regions with another encoder than x265"
         unit = self._encoder.encode(frame, keyframe=keyframe)
         data = getattr(unit, "data", None)
         if not isinstance(data, bytes) or not data:
             raise ValueError(f"it gave no access unit for frame {frame.index}, and has to give one for each")
+        data = without_filler(data)
         # To begin a decoder with it takes both; another I picture is a large frame like any other.
         begins = is_keyframe(data) and bool(parameter_sets(data))
         if (keyframe or not self._begun) and not begins:
@@ -325,7 +327,6 @@ class EncoderPlan:
     edge_id: str
     window_s: float
     metadata_bps: int
-    side_data: bool
     threads: int
     headroom: float = 1.0
     """The share of its rate that the encoder is set to."""
@@ -341,7 +342,6 @@ class EncoderPlan:
             base_bps=rates.base_bps,
             edge_id=self.edge_id,
             window_s=self.window_s,
-            side_data=self.side_data,
         )
         bitrate_bps = max(1, round(settings.bitrate_bps * self.headroom))
         return open_encoder(self.name, replace(settings, bitrate_bps=bitrate_bps, threads=self.threads))

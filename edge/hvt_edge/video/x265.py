@@ -2,10 +2,9 @@
 
 Settings and why (measured on drone_carpark, intel_car-detection and a panning aerial still, 100 to 1138 kbps):
 
-* ``strict-cbr`` with a VBV of 0.15 s keeps the run within 1.02 and each rolling second within 1.14 of the target
-  from 300 kbps up, on-demand keyframes included. Without it x265 under-spends (0.7 to 0.95 of the target); with
-  0.2 s a keyframe on demand reaches 1.18. Of a still scene 16 to 40 % of the bytes are x265's
-  filler, of a moving one 2 (docs/design-notes/base-stream.md).
+* A VBV of 0.15 s keeps the run within 1.02 and each rolling second within 1.14 of the target from 300 kbps up,
+  on-demand keyframes included; with 0.2 s a keyframe on demand reaches 1.18. x265 leaves up to 40 % of the rate
+  unused after a keyframe of a still scene (``strict-cbr`` only fills that up with filler): `SpareRate` uses it.
 * ``keyint=-1``: no keyframe comes by itself. The edge asks for each one, so that stills can yield to it.
 * ``pools``: with several worker threads the row-level rate control sees a different order of rows each run, and the
   same input gives other bytes. Lockstep therefore uses one; real time uses what there is, which halves the time of a
@@ -16,8 +15,8 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
   stays a plain I frame that nobody can start at; ``repeat-headers=1`` puts the parameter sets before an IDR.
 * ``info=0``: else each keyframe carries x265's settings as text, 2.4 kB.
 * BT.709 limited range, signalled: viewers assume it for HD.
-* ``side_data`` attaches regions of interest (`RegionTagger`). Without any region the bytes are the same as without
-  it, the two fastest presets apart.
+* Each picture carries regions of interest (`RegionTagger`). Without any region the bytes are the same as without, the
+  two fastest presets apart.
 """
 
 from __future__ import annotations
@@ -80,12 +79,17 @@ class RegionTagger:
         self._regions: Sequence[Region] = ()
         """Those of the graph."""
 
-    def tag(self, picture: av.VideoFrame, regions: Iterable[Region]) -> av.VideoFrame:
+    def tag(self, picture: av.VideoFrame, regions: Iterable[Region], *, whole: float = 0.0) -> av.VideoFrame:
         """The same picture with these regions; where two overlap, the deeper one counts.
 
-        The result is valid until the next call: its side data belongs to the filter graph of this call.
+        ``whole`` is an offset of the whole picture, to which those of the regions are added. The result is valid
+        until the next call: its side data belongs to the filter graph of this call.
         """
-        wanted = usable(regions, size=(picture.width, picture.height))
+        size = (picture.width, picture.height)
+        wanted = usable(regions, size=size)
+        if whole:
+            wanted = [Region(one.box_px, min(1.0, max(-1.0, one.offset + whole))) for one in wanted]
+            wanted.append(Region((0, 0, *size), whole))  # the first that covers a block counts
         if self._graph is None or wanted != self._regions:
             self._graph, self._regions = _attaching(wanted, picture), wanted
         self._graph.push(picture)
@@ -113,7 +117,7 @@ def _attaching(regions: Iterable[Region], picture: av.VideoFrame) -> Graph:
     return graph
 
 
-def usable(regions: Iterable[Region], *, size: tuple[int, int]) -> Sequence[Region]:
+def usable(regions: Iterable[Region], *, size: tuple[int, int]) -> list[Region]:
     """Clip to the picture, deepest first, at most `MOST_REGIONS`; one of offset 0 where none is left."""
     width, height = size
     inside = []
@@ -174,6 +178,44 @@ class TrackRegions:
         return float(mask.mean())
 
 
+class SpareRate:
+    """The steps of the quantiser by which frames are coded finer than x265 would, so that they use the rate.
+
+    x265 follows a scene slowly: a keyframe is as coarse as the VBV makes it, and after it the picture of a still
+    camera would get better for five seconds while a third of the rate, and more, is left unused. So each frame whose
+    rest does not fit into the VBV makes the next ones finer. x265 knows nothing of it but the bits that it takes, and
+    keeps its VBV as ever.
+    """
+
+    _STEPS_PER_FRAME = 5.0
+    """For a frame that has used none of its share."""
+    _KEPT = 0.985
+    """Of the steps, by the next frame: what is no longer needed goes."""
+    _AFTER_KEYFRAME = 0.5
+    """Of the steps; the keyframe itself has none."""
+    _MOST_STEPS = 24.0
+
+    def __init__(self, settings: EncoderSettings) -> None:
+        self._frame_bits = settings.bitrate_bps / settings.fps
+        self._depth_bits = settings.bitrate_bps * settings.vbv_s
+        self._free_bits = 0.9 * self._depth_bits  # x265's ``vbv-init``
+        self._steps = 0.0
+
+    @property
+    def steps(self) -> int:
+        """Of the next frame, unless it is a keyframe."""
+        return round(self._steps)
+
+    def coded(self, size_bytes: int, *, keyframe: bool) -> None:
+        """A frame took so much."""
+        self._free_bits = max(0.0, self._free_bits - 8 * size_bytes) + self._frame_bits
+        lost_bits = max(0.0, self._free_bits - self._depth_bits)
+        self._free_bits -= lost_bits
+        finer = self._KEPT * self._steps + self._STEPS_PER_FRAME * lost_bits / self._frame_bits
+        self._steps = min(self._MOST_STEPS, self._AFTER_KEYFRAME * self._steps if keyframe else finer)
+
+
+_QP_STEPS = 51
 _QP_TO_LAMBDA = 118
 _WITHOUT_AQ = ("ultrafast", "superfast")
 """Presets without adaptive quantisation, where x265 ignores regions: a trace of it makes them count."""
@@ -191,7 +233,7 @@ class BaseEncoder:
         """Once it is closed."""
         with self._workers:
             self._context: VideoCodecContext | None = _open(settings)
-        self._tagger = RegionTagger() if settings.side_data else None
+        self._tagger, self._spare = RegionTagger(), SpareRate(settings)
         self._count = 0
         self._caller_ns = self._wall_ns = 0
         self.mean_qp = math.nan
@@ -200,20 +242,20 @@ class BaseEncoder:
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
         """Encode ``frame.base_bgr``; with ``keyframe`` as an IDR that starts a new decodable run.
 
-        ``regions`` need ``EncoderSettings.side_data``; where they overlap the deeper one counts.
+        Where ``regions`` overlap the deeper one counts.
         """
         assert self._context is not None, "it is open"
-        assert self._tagger is not None or not regions, "regions need EncoderSettings.side_data"
         began_ns, began_cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         picture = yuv_picture(self._to_yuv, frame.base_bgr)
-        if self._tagger is not None:
-            picture = self._tagger.tag(picture, regions)
+        finer = 0 if keyframe else self._spare.steps
+        picture = self._tagger.tag(picture, regions, whole=-finer / _QP_STEPS)
         picture.pts = self._count
         picture.pict_type = PictureType.I if keyframe else PictureType.NONE
         self._count += 1
         (packet,) = self._context.encode(picture)  # zero latency: one in, one out
         if packet.is_keyframe:  # the first is one, and by then each worker has lowered its priority
             self._workers.raise_priority()
+        self._spare.coded(packet.size, keyframe=packet.is_keyframe)
         self.mean_qp = mean_qp_of(packet)
         self._caller_ns += time.thread_time_ns() - began_cpu_ns
         self._wall_ns += time.perf_counter_ns() - began_ns
@@ -235,7 +277,7 @@ class BaseEncoder:
     def close(self) -> None:
         """End x265's threads, and give back its memory: 12.5 MB for each of some frames of 1280x720."""
         self._spent = self.spent
-        self._context = self._tagger = None
+        self._context, self._tagger = None, RegionTagger()
 
 
 def yuv_picture(
@@ -285,7 +327,6 @@ def _open(settings: EncoderSettings) -> VideoCodecContext:
         "open-gop": 0,
         "vbv-maxrate": kbps,
         "vbv-bufsize": max(1, round(kbps * settings.vbv_s)),
-        "strict-cbr": 1,
         "pools": settings.threads,
         "frame-threads": 1,
         "colorprim": "bt709",
@@ -295,7 +336,7 @@ def _open(settings: EncoderSettings) -> VideoCodecContext:
         "log-level": "none",
         "info": 0,
     }
-    if settings.side_data and settings.preset in _WITHOUT_AQ:
+    if settings.preset in _WITHOUT_AQ:
         parameters |= {"aq-mode": 1, "aq-strength": 0.01}
     context = encoder_context("libx265")
     context.width, context.height = settings.size

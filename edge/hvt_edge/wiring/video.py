@@ -169,7 +169,6 @@ def encoder_plan(config: EdgeConfig, size: tuple[int, int], *, headroom: float =
         edge_id=config.edge_id,
         window_s=config.window,
         metadata_bps=config.metadata_bps,
-        side_data=config.roi_depth > 0,
         threads=1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1),
         headroom=headroom,
     )

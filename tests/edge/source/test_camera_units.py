@@ -38,6 +38,17 @@ def test_what_needs_nothing_stays_as_it_is(tmp_path):
     assert [units.unit(packet).data for packet in packets] == packets
 
 
+def test_filler_is_left_out(tmp_path):
+    """A quarter of a thin link would carry nothing where a camera at a constant rate looks at a still scene."""
+    packets = packets_of(write_clip(tmp_path / "a.hevc"))
+    filler = LONG_START + bytes([38 << 1, 1]) + b"\xff" * 500 + b"\x80"
+    units = CameraUnits(b"")
+    found = [units.unit(packet + filler) for packet in packets]
+    assert [nal_units(one.data) for one in found] == [nal_units(packet) for packet in packets]
+    with pytest.raises(ValueError, match="holds 0 pictures"):
+        units.unit(filler)
+
+
 def test_sets_that_came_once_are_put_before_later_keyframes(tmp_path):
     """Some cameras send them with the first keyframe alone."""
     packets = packets_of(write_clip(tmp_path / "a.hevc"))

@@ -31,7 +31,7 @@ from rigs.world import Puts, make_base_stage, make_operating, make_transmitter
 
 SIZE = (320, 192)
 SECOND_NS = 1_000_000_000
-SETTINGS = EncoderSettings(size=SIZE, fps=15.0, bitrate_bps=50_000, preset="ultrafast", side_data=True)
+SETTINGS = EncoderSettings(size=SIZE, fps=15.0, bitrate_bps=50_000, preset="ultrafast")
 
 
 class Rig:

@@ -19,7 +19,7 @@ from hvt_edge.video.x265 import MOST_REGIONS, BaseEncoder, Region
 from media.clips import framed, hard_pictures, smooth_pictures
 
 SIZE = (320, 192)
-VPS, SPS, PPS, IDR = 32, 33, 34, (19, 20)
+VPS, SPS, PPS, IDR, FILLER = 32, 33, 34, (19, 20), 38
 
 
 def settings(**changes) -> EncoderSettings:
@@ -189,8 +189,8 @@ BOX = (96, 64, 192, 128)
 def test_a_region_gets_a_better_picture(preset):
     """R0 would change nothing."""
     pictures = hard_pictures(24, size=SIZE)[:20]
-    plain = errors_at(pictures, encode(pictures, preset=preset, side_data=True), BOX)
-    units = encode(pictures, preset=preset, side_data=True, regions=lambda _: [Region(BOX, -0.2)])
+    plain = errors_at(pictures, encode(pictures, preset=preset), BOX)
+    units = encode(pictures, preset=preset, regions=lambda _: [Region(BOX, -0.2)])
     better = errors_at(pictures, units, BOX)
     assert better[0] < 0.7 * plain[0]
     assert better[1] > plain[1], "the rest pays for it"
@@ -200,9 +200,7 @@ def test_where_regions_overlap_the_deeper_one_counts():
     """A track beside another would lose what it has."""
     pictures = hard_pictures(24, size=SIZE)[:16]
     both = [Region((0, 0, *SIZE), 0.1), Region(BOX, -0.2)]
-    first, second = (
-        encode(pictures, side_data=True, regions=lambda _, order=order: order) for order in (both, both[::-1])
-    )
+    first, second = (encode(pictures, regions=lambda _, order=order: order) for order in (both, both[::-1]))
     assert [unit.data for unit in first] == [unit.data for unit in second]
     inside, outside = errors_at(pictures, first, BOX)
     assert inside < 0.7 * outside
@@ -212,19 +210,12 @@ def test_regions_that_come_late_and_go_again_are_safe():
     """x265 ends the process where side data comes to a stream that began without."""
     pictures = hard_pictures(30, size=SIZE)
     wanted = {10: [Region(BOX, -0.3)], 11: [Region((0, 0, *SIZE), -0.3)], 20: [Region(BOX, 0.2)] * 300}
-    units = encode(pictures, keyframes=(15,), side_data=True, regions=lambda index: wanted.get(index, ()))
+    units = encode(pictures, keyframes=(15,), regions=lambda index: wanted.get(index, ()))
     plain = encode(pictures, keyframes=(15,))
     assert [unit.data for unit in units[:10]] == [unit.data for unit in plain[:10]]
     assert units[10].data != plain[10].data
     decoder = BaseDecoder()
     assert all(decoder.decode(unit.data) is not None for unit in units)
-
-
-def test_side_data_alone_changes_no_byte():
-    """Figures with a plan that asks for nothing could not be compared with those without."""
-    pictures = hard_pictures(20, size=SIZE)
-    plain, marked = (encode(pictures, keyframes=(7,), side_data=one) for one in (False, True))
-    assert [unit.data for unit in plain] == [unit.data for unit in marked]
 
 
 @pytest.mark.parametrize(
@@ -242,7 +233,7 @@ def test_side_data_alone_changes_no_byte():
 def test_a_region_at_or_beyond_the_rim_is_cut(region):
     """A track that leaves the picture would end the edge."""
     pictures = hard_pictures(6, size=SIZE)
-    units = encode(pictures, side_data=True, regions=lambda index: [region] * (index % 2))
+    units = encode(pictures, regions=lambda index: [region] * (index % 2))
     decoder = BaseDecoder()
     assert all(decoder.decode(unit.data) is not None for unit in units)
 
@@ -252,8 +243,8 @@ def test_more_regions_than_are_taken_are_left_out():
     pictures = hard_pictures(4, size=SIZE)
     wanted = [Region((x, y, x + 8, y + 8), -0.1) for x in range(0, 320, 8) for y in range(0, 192, 8)]
     assert len(wanted) > MOST_REGIONS
-    units = encode(pictures, side_data=True, regions=lambda _: wanted)
-    few = encode(pictures, side_data=True, regions=lambda _: wanted[:MOST_REGIONS])
+    units = encode(pictures, regions=lambda _: wanted)
+    few = encode(pictures, regions=lambda _: wanted[:MOST_REGIONS])
     assert [unit.data for unit in units] == [unit.data for unit in few]
 
 
@@ -262,7 +253,7 @@ def test_regions_that_stay_are_not_set_up_again(monkeypatch):
     made = []
     monkeypatch.setattr(x265, "Graph", lambda: made.append(Graph()) or made[-1])
     pictures, wanted = hard_pictures(6, size=SIZE), [Region(BOX, -0.2)]
-    units = encode(pictures, side_data=True, regions=lambda index: [*wanted] if index > 1 else ())
+    units = encode(pictures, bitrate_bps=40_000, regions=lambda index: [*wanted] if index > 1 else ())
     assert (len(units), len(made)) == (6, 2)
 
 
@@ -286,10 +277,22 @@ def test_a_new_encoder_goes_on_in_the_same_stream():
     decoder = BaseDecoder()
     for encoder, part in (
         (BaseEncoder(settings(bitrate_bps=800_000)), frames[:10]),
-        (BaseEncoder(settings(bitrate_bps=800_000, fps=5.0, side_data=True)), frames[10::3]),
+        (BaseEncoder(settings(bitrate_bps=800_000, fps=5.0)), frames[10::3]),
     ):
         for frame in part:
             decoded = decoder.decode(encoder.encode(frame, keyframe=frame is part[0]).data)
             error = (decoded.astype(np.float64) - frame.base_bgr).mean()
             assert decoded.shape == (SIZE[1], SIZE[0], 3)
             assert abs(error) < 3
+
+
+@pytest.mark.parametrize("preset", ["superfast", "veryfast"])
+def test_a_still_camera_uses_its_rate_after_a_keyframe(preset):
+    """x265 left half of it unused for five seconds, while the picture was as coarse as the keyframe."""
+    chance, scene = np.random.default_rng(5), hard_pictures(1, size=SIZE)[0].astype(np.float64)
+    pictures = [np.clip(scene + chance.normal(0, 6, scene.shape), 0, 255).astype(np.uint8) for _ in range(75)]
+    units = encode(pictures, keyframes=(30,), preset=preset)
+    bits = [8 * len(unit.data) for unit in units]
+    assert sum(bits[31:]) * 15 / 44 >= 0.75 * 200_000
+    assert max(sum(bits[start : start + 15]) for start in range(61)) <= 1.1 * 200_000
+    assert FILLER not in {kind for unit in units for kind in nal_types(unit.data)}

@@ -7,9 +7,10 @@ import math
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.hevc import BaseDecoder, nal_kind, nal_units
 from hvt_edge.video.encoder import (
     HARDWARE,
+    CheckedEncoder,
     EncoderSettings,
     HardwareRow,
     check_encoder,
@@ -121,6 +122,21 @@ def test_the_class_behind_the_rows_codes():
         assert shown is not None
         assert abs(shown.astype(int) - frame.base_bgr).mean() < 8
         assert 0 < encoder.mean_qp < 51
+
+
+def test_filler_is_left_out():
+    """A rate that a still scene does not need would be sent all the same."""
+    params = (
+        "log-level=none:repeat-headers=1:bframes=0:rc-lookahead=0:strict-cbr=1:vbv-maxrate=200:vbv-bufsize=30"
+    )
+    options = {"preset": "ultrafast", "tune": "zerolatency", "x265-params": params}
+    row, sizes = HardwareRow("libx265", "yuv420p", "nothing", options), []
+    for encoder in (HardwareEncoder(SETTINGS, row=row), CheckedEncoder(HardwareEncoder(SETTINGS, row=row))):
+        units = [encoder.encode(frame) for frame in framed(smooth_pictures(1, size=SIZE) * 15)]
+        sizes.append(sum(len(unit.data) for unit in units[1:]))
+        kinds = {nal_kind(nal) for unit in units for nal in nal_units(unit.data)}
+        assert (38 in kinds) is (len(sizes) == 1)
+    assert sizes[1] < 0.5 * sizes[0]
 
 
 def test_a_row_of_hardware_that_delays_is_an_error():
