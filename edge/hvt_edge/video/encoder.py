@@ -43,8 +43,8 @@ _FRAME_FLOOR_BITS_PER_PX = 0.0045
 # The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
-_VBV_FRAMES = 1.5
-"""At least: with one alone x265 uses .7 of its rate, with 2 the fullest second reaches 1.2."""
+_VBV_FRAMES, _TIGHT_VBV_FRAMES = 1.3, 1.15
+"""At least: with one alone x265 uses .7 of its rate; with more, keyframes at few frames a second get long."""
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
 _KEYFRAME_EVERY_S = 5.0
 """x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
@@ -82,7 +82,7 @@ def usual_keyframe_bytes(size: tuple[int, int]) -> int:
 
 def most_keyframe_bytes(size: tuple[int, int], fps: float, base_bps: int) -> int:
     """About the most that a keyframe takes: what the VBV holds at this B_v, or what x265 cannot go below."""
-    return max(keyframe_floor_bytes(size), round(_vbv_s(fps) * base_bps / 8))
+    return max(keyframe_floor_bytes(size), round(vbv_s(fps) * base_bps / 8))
 
 
 def keyframe_interval_s(size: tuple[int, int], base_bps: int) -> float:
@@ -148,7 +148,7 @@ def encoder_settings(
         fps=fps,
         bitrate_bps=max(1, round(payload_bps)),
         preset=preset,
-        vbv_s=_vbv_s(fps, tight=tight),
+        vbv_s=vbv_s(fps, tight=tight),
     )
 
 
@@ -163,8 +163,9 @@ def payload_bps(base_bps: int, *, size: tuple[int, int], fps: float, edge_id: st
     return max(1.0, base_bps - _beside_bps(base_bps, size=size, fps=fps, edge_id=edge_id))
 
 
-def _vbv_s(fps: float, *, tight: bool = False) -> float:
-    return max(_TIGHT_VBV_S if tight else VBV_S, _VBV_FRAMES / fps)
+def vbv_s(fps: float, *, tight: bool = False) -> float:
+    """Depth of the VBV at this rate of coded frames."""
+    return max(_TIGHT_VBV_S, _TIGHT_VBV_FRAMES / fps) if tight else max(VBV_S, _VBV_FRAMES / fps)
 
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:

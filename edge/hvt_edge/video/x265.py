@@ -189,7 +189,7 @@ class SpareRate:
 
     _STEPS_PER_FRAME = 5.0
     """For a frame that has used none of its share."""
-    _KEPT = 0.985
+    _DECAY = 0.985
     """Of the steps, by the next frame: what is no longer needed goes."""
     _AFTER_KEYFRAME = 0.5
     """Of the steps; the keyframe itself has none."""
@@ -211,7 +211,7 @@ class SpareRate:
         self._free_bits = max(0.0, self._free_bits - 8 * size_bytes) + self._frame_bits
         lost_bits = max(0.0, self._free_bits - self._depth_bits)
         self._free_bits -= lost_bits
-        finer = self._KEPT * self._steps + self._STEPS_PER_FRAME * lost_bits / self._frame_bits
+        finer = self._DECAY * self._steps + self._STEPS_PER_FRAME * lost_bits / self._frame_bits
         self._steps = min(self._MOST_STEPS, self._AFTER_KEYFRAME * self._steps if keyframe else finer)
 
 

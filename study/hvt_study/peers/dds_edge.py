@@ -14,7 +14,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.video.encoder import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.video.encoder import EncoderSettings, keyframe_floor_bytes, minimum_bps, vbv_s
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.peers.dds_line import Line, header_bps
@@ -103,9 +103,9 @@ class DdsEdge:
         self._budget: RollingBudget = line.budget
         self._segments = {frames[0]: frames for frames in segments}
         self._first_size = settings.first_size(size)
-        fps, preset, vbv_s = settings.rate, settings.preset, max(VBV_S, 1 / settings.rate)
+        fps, preset, depth_s = settings.rate, settings.preset, vbv_s(settings.rate)
         self._first, self._second = (
-            BaseEncoder(EncoderSettings(coded, fps=fps, bitrate_bps=rate_bps, preset=preset, vbv_s=vbv_s))
+            BaseEncoder(EncoderSettings(coded, fps=fps, bitrate_bps=rate_bps, preset=preset, vbv_s=depth_s))
             for coded, rate_bps in ((self._first_size, rates.first_bps), (size, rates.second_bps))
         )
         self._most = most_stored(settings)

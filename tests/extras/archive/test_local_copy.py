@@ -143,7 +143,7 @@ def test_a_full_card_stops_the_copy_alone_and_it_goes_on_in_a_new_file(tmp_path,
     failures = Failures(time.time_ns)
     coded = units(60)
     with small_disk(tmp_path / "card") as card:
-        (card / "old.bin").write_bytes(bytes(990_000))
+        (card / "old.bin").write_bytes(bytes(1_020_000))
         with LocalCopy(card / "base.mkv", failures=failures, pause=RetryPause(SECOND_NS // 10)) as recorder:
             for unit in coded:
                 recorder.write(unit)

@@ -106,7 +106,7 @@ def test_every_byte_of_both_passes_counts_once(report):
     """A peer whose second pass came for free would beat everybody."""
     assert set(report.line_bytes) == {"base", "roi", "control"}
     sent = report.messages["roi"]
-    assert FRAMES / 4 < sent < FRAMES  # some frames share a message
+    assert 1 < sent < FRAMES  # some frames share a message
     assert report.messages == {"base": FRAMES, "roi": sent, "control": 4}
     account = report.account
     assert sum(report.line_bytes.values()) == account.line_bytes

@@ -39,14 +39,14 @@ from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.backlog.assembly import BacklogAssembly
-from media.clips import START_NS, framed, smooth_pictures
+from media.clips import START_NS, framed, hard_pictures
 from programs.processes import eventually
 from rigs.kept import INFO, S, opened
 from rigs.messages import feedback, still_of
 from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
 
 SIZE = (320, 192)
-FRAMES = framed(smooth_pictures(210, size=SIZE))
+FRAMES = framed(hard_pictures(210, size=SIZE))
 STILL = still_of(b"\xff" * 1500, sequence=2**31, frame_index=3, capture_ns=START_NS, track_id=1)
 PENDING = replace(STILL, crop_bgr=np.zeros((4, 4, 3), np.uint8), data=b"")
 

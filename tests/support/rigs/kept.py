@@ -10,7 +10,7 @@ from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
-from media.clips import START_NS, framed, smooth_pictures
+from media.clips import START_NS, framed, hard_pictures
 from rigs.flight import Flight
 from rigs.messages import ROI
 
@@ -22,7 +22,7 @@ INFO = Flight(1).info()
 def coded(count: int, *, keyframe_each: int = 15) -> list[AccessUnit]:
     """Access units at 15 fps."""
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast"))
-    frames = framed(smooth_pictures(count, size=SIZE))
+    frames = framed(hard_pictures(count, size=SIZE))
     return [encoder.encode(frame, keyframe=frame.index % keyframe_each == 0) for frame in frames]
 
 

@@ -99,7 +99,9 @@ class _Encoder:
             wanted = min(8 * mean, 0.9 * self.vbv_s * self.bitrate_bps / 8)
         else:
             least = self.texture * minimum_bps(self.size, self.fps) / 8 / self.fps
-            wanted = min(0.95 * mean * self.chance.uniform(0.75, 1.25), self.vbv_s * self.bitrate_bps / 8)
+            wanted = min(
+                0.95 * mean * self.chance.uniform(0.75, 1.25), 0.9 * self.vbv_s * self.bitrate_bps / 8
+            )
         return AccessUnit(frame.index, frame.capture_ns, bytes(max(20, round(max(least, wanted)))), keyframe)
 
 
