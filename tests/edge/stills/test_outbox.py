@@ -316,6 +316,17 @@ def test_what_the_ground_cannot_decode_is_pending_once_more_and_only_once(report
     assert outbox.unacknowledged == (0 if reported else 2)
 
 
+def test_a_still_that_is_coded_again_keeps_the_parameters_of_its_method():
+    """The ground would not know any more by what the method chose it."""
+    outbox = Outbox()
+    one = sent(outbox, 3, resend=10)
+    assert one.job is not None
+    one.job = one.job.with_header(parameters={"utility": 0.5})
+    outbox.on_undecodable(3)
+    outbox.offer_undecodable(1)
+    assert [again.crop.header.parameters for again in outbox.pending] == [{"utility": 0.5, AGAIN: 3}]
+
+
 def test_a_newer_still_of_the_track_makes_it_needless():
     """Bits would go to the object as it was, while its present picture waits."""
     outbox = Outbox()
