@@ -64,7 +64,11 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         _check_coded(spec)
     if is_demo(spec):
         return DemoSource(spec, settings, seed=seed)
-    scheme = "" if is_local(spec) else spec.partition("://")[0].lower()
+    scheme = ""
+    if not is_local(spec):
+        scheme, mark, rest = spec.partition("://")
+        scheme = scheme.lower()  # RFC 3986, 3.1; FFmpeg knows small letters only
+        spec = f"{scheme}{mark}{rest}"
     if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
         _check_port(spec, scheme)
         stream = (CodedStreamGrabber if coded else StreamGrabber)(spec, read_s=patience_s(fps))

@@ -25,6 +25,8 @@ _GATEWAYS = Group("gateways", rare=True)
 
 def _url(text: str, *, name: str) -> str:
     """``udp``, ``tcp`` or ``tls``, a host and a port. No IPv6 address: the client, pytak, knows none."""
+    scheme, mark, rest = text.partition("://")
+    text = f"{scheme.lower()}{mark}{rest}"  # RFC 3986, 3.1
     try:
         parts = urlsplit(text)
         good = parts.scheme in ("udp", "tcp", "tls") and bool(parts.hostname) and bool(parts.port)

@@ -39,7 +39,7 @@ class Address:
 
     @property
     def scheme(self) -> Literal["udp", "srt"]:
-        return "srt" if self.url.lower().startswith("srt:") else "udp"
+        return "srt" if self.url.startswith("srt:") else "udp"
 
     @property
     def shown(self) -> str:
@@ -65,7 +65,8 @@ def destination(text: str) -> Address | Path:
             raise UserError(f"--ts {text} is none of what it may be: {_ACCEPTED}")
         return path
     parts = _split(text)
-    address = Address(text)
+    scheme, mark, rest = text.partition("://")
+    address = Address(f"{scheme.lower()}{mark}{rest}")  # RFC 3986, 3.1; FFmpeg knows small letters only
     if parts.scheme == "udp":
         _ttl(parts, text)
     if parts.scheme not in ("udp", "srt") or not parts.hostname or parts.path.strip("/") or parts.username:

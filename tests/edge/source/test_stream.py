@@ -90,6 +90,16 @@ def test_a_stream_without_a_port_is_refused(address):
         open_source(address, size=(320, 180), fps=15)
 
 
+@pytest.mark.parametrize("scheme", ["RTSP", "Http", "UDP"])
+def test_a_scheme_in_capitals_is_the_same(monkeypatch, scheme):
+    """FFmpeg knows no RTSP://, which a phone's keyboard writes: the camera was refused (RFC 3986, 3.1)."""
+    opened = []
+    monkeypatch.setattr(StreamGrabber, "open", lambda self: opened.append(self.name) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        open_source(f"{scheme}://127.0.0.1:5600/", size=(320, 180), fps=15)
+    assert opened == [f"{scheme.lower()}://127.0.0.1:5600/"]
+
+
 def test_a_port_to_listen_on_is_one(monkeypatch):
     """FFmpeg listens on ?localport= of udp://, and the edge refused the address for want of a port."""
     opened = []
