@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import argparse
+import logging
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,8 +17,11 @@ from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
+from hvt_ground.sinks.rerun.readable import readable
 from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
+
+_log = logging.getLogger(__name__)
 
 _FLUSH_S = 10.0
 
@@ -48,12 +53,20 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
 
 
 def _read(path: Path) -> tuple[str, list[Chunk]]:
-    # The edge's id, and everything but the file's own entities.
+    # The edge's id, and everything but the file's own entities; of a damaged file what can be read.
     try:
-        reader = open_rrd(path)
-        return id_of(reader).edge, [one for one in reader.stream() if not one.entity_path.startswith("/__")]
+        with path.open("rb"), tempfile.TemporaryDirectory() as folder:
+            found = readable(path, Path(folder) / "readable.rrd")
+            if found is None:
+                raise ValueError("nothing in it can be read")  # noqa: TRY301 - in one sentence with the others
+            reader = open_rrd(found)
+            chunks = [one for one in reader.stream() if not one.entity_path.startswith("/__")]
+            edge = id_of(reader).edge
     except (OSError, RuntimeError, ValueError) as error:
         raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
+    if found != path:
+        _log.warning("%s is damaged or breaks off: what can be read is joined", path)
+    return edge, chunks
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -29,8 +29,6 @@ import rerun_bindings as bindings
 
 from hvt_common.errors import UserError
 
-os.environ.pop("RERUN", None)  # the SDK's switch: with "off" recordings and live views would stay empty
-
 _list_of_recordings = threading.RLock()
 
 
@@ -69,7 +67,7 @@ class _NoPandas(MetaPathFinder):
 
 def new_recording(one: RecordingId) -> rr.RecordingStream:
     """A recording without the SDK's own two timelines, which would cost bytes and mean nothing here."""
-    with _list_of_recordings:
+    with _list_of_recordings, _switched_on():
         recording = rr.RecordingStream(
             one.application, recording_id=f"{one.edge}-{one.session}", send_properties=False
         )
@@ -78,11 +76,22 @@ def new_recording(one: RecordingId) -> rr.RecordingStream:
     return recording
 
 
+@contextmanager
+def _switched_on() -> Iterator[None]:
+    # ``RERUN=off`` is the SDK's switch for other programs: what begins with it stays empty.
+    switch = os.environ.pop("RERUN", None)
+    try:
+        yield
+    finally:
+        if switch is not None:
+            os.environ["RERUN"] = switch
+
+
 def send_blueprint(recording: rr.RecordingStream, one: RecordingId, blueprint: rrb.Blueprint) -> None:
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
     _number(blueprint.root_container, "hvt")
     # As rerun.sinks.send_blueprint has it, but for the end: stream and storage hold each other until then.
-    with releasing_recordings():
+    with releasing_recordings(), _switched_on():
         stream = rr.RecordingStream._from_native(  # noqa: SLF001
             bindings.new_blueprint(
                 application_id=one.application,

@@ -64,10 +64,11 @@ def test_recordings_have_the_same_paths(tmp_path):
 def test_the_sdks_switch_leaves_no_recording_empty(tmp_path):
     """Who has RERUN=off for other programs of the machine flew, and found a file of no bytes."""
     program = """
-import sys
+import os, sys
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording
 
 recording = new_recording(RecordingId("uav-1", "0"))
+assert os.environ["RERUN"] == "off", "it is for a program that uses the library, and its children"
 recording.log_file_from_contents("a.txt", b"a")
 recording.save(sys.argv[1])
 """
