@@ -29,7 +29,7 @@ from hvt_ground.poses import NOWHERE
 @pytest.mark.parametrize(
     ("words", "package"),
     [
-        (["--cot", "UDP://239.2.3.1:6969"], "cot"),
+        (["--cot", "udp://239.2.3.1:6969"], "cot"),
         (["--mcap=a.mcap"], "mcap"),
         (["--ts", "a.ts"], "ground"),
         (["--terrain", "a.tif"], "terrain"),

@@ -50,6 +50,12 @@ def requested_host(header: str) -> str:
     return parts.hostname or "" if valid and plain else ""
 
 
+def with_small_scheme(url: str) -> str:
+    """The same address: RFC 3986, 3.1, knows no capitals in a scheme, and FFmpeg and pytak take none."""
+    scheme, mark, rest = url.partition("://")
+    return f"{scheme.lower()}{mark}{rest}"
+
+
 def host_and_port(address: str, *, name: str, example: str) -> tuple[str, int]:
     """Split ``HOST:PORT``. Raises `UserError`, which names the option, for anything else."""
     try:

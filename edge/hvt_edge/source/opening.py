@@ -10,6 +10,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import HIDDEN, redacted
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.host_names import with_small_scheme
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
 from hvt_edge.source.camera_stream import REENCODE
@@ -64,11 +65,8 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         _check_coded(spec)
     if is_demo(spec):
         return DemoSource(spec, settings, seed=seed)
-    scheme = ""
-    if not is_local(spec):
-        scheme, mark, rest = spec.partition("://")
-        scheme = scheme.lower()  # RFC 3986, 3.1; FFmpeg knows small letters only
-        spec = f"{scheme}{mark}{rest}"
+    spec = spec if is_local(spec) else with_small_scheme(spec)
+    scheme = "" if is_local(spec) else spec.partition("://")[0]
     if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
         _check_port(spec, scheme)
         stream = (CodedStreamGrabber if coded else StreamGrabber)(spec, read_s=patience_s(fps))

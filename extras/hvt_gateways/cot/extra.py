@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 from hvt_common.config import PATH, Group, SettingType
 from hvt_common.errors import UserError, needs_extra
+from hvt_common.runtime.host_names import with_small_scheme
 from hvt_common.units import SECOND_NS
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
@@ -25,8 +26,7 @@ _GATEWAYS = Group("gateways", rare=True)
 
 def _url(text: str, *, name: str) -> str:
     """``udp``, ``tcp`` or ``tls``, a host and a port. No IPv6 address: the client, pytak, knows none."""
-    scheme, mark, rest = text.partition("://")
-    text = f"{scheme.lower()}{mark}{rest}"  # RFC 3986, 3.1
+    text = with_small_scheme(text)
     try:
         parts = urlsplit(text)
         good = parts.scheme in ("udp", "tcp", "tls") and bool(parts.hostname) and bool(parts.port)

@@ -18,7 +18,7 @@ import av
 import av.error
 
 from hvt_common.errors import UserError, named_path, telling
-from hvt_common.runtime.host_names import is_group
+from hvt_common.runtime.host_names import is_group, with_small_scheme
 from hvt_ground.sinks.line_file import check_there
 
 _log = logging.getLogger(__name__)
@@ -65,8 +65,7 @@ def destination(text: str) -> Address | Path:
             raise UserError(f"--ts {text} is none of what it may be: {_ACCEPTED}")
         return path
     parts = _split(text)
-    scheme, mark, rest = text.partition("://")
-    address = Address(f"{scheme.lower()}{mark}{rest}")  # RFC 3986, 3.1; FFmpeg knows small letters only
+    address = Address(with_small_scheme(text))
     if parts.scheme == "udp":
         _ttl(parts, text)
     if parts.scheme not in ("udp", "srt") or not parts.hostname or parts.path.strip("/") or parts.username:

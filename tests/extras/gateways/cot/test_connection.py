@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.serialization import pkcs12
 from cryptography.x509 import load_pem_x509_certificate
 
+from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_gateways.cot import connection as cot_connection
@@ -471,3 +472,10 @@ def test_nothing_goes_stale_between_two_tries():
     config = CotOptions(cot=("tcp://127.0.0.1:1",))
     CotExtra().start(config, Opened())  # type: ignore[arg-type]
     assert 3 * pauses_s[0] <= STALE_NS / 1e9
+
+
+def test_a_scheme_in_capitals_is_the_same():
+    """It was refused, or taken and never reported to: pytak knows small letters only."""
+    words = ["--cot", "UDP://239.2.3.1:6969", "--cot", "Tcp://TAK:8087"]
+    given, _ = load(CotOptions, words, program="hvt-ground", description="")
+    assert given.cot == ("udp://239.2.3.1:6969", "tcp://TAK:8087")
