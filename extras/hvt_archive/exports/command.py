@@ -55,7 +55,8 @@ def write_csv(recorded: Recorded, path: Path) -> None:
 def write_parquet(recorded: Recorded, path: Path) -> None:
     schema = pa.schema([(name, _TYPES[name]) for name in TRACK_COLUMNS])
     rows = _rows(recorded)
-    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+    # Not by its name: Arrow takes one in UTF-8 only.
+    with path.open("wb") as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
         while batch := list(islice(rows, _BATCH_ROWS)):
             writer.write_table(_table(batch, schema))
 

@@ -48,7 +48,8 @@ def write_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     )
     scratch = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        pq.write_table(table, scratch, compression="zstd")
+        with scratch.open("wb") as file:  # not by its name: Arrow takes one in UTF-8 only
+            pq.write_table(table, file, compression="zstd")
         scratch.replace(path)
     except OSError as error:
         scratch.unlink(missing_ok=True)
@@ -61,7 +62,8 @@ def read_results(path: Path) -> list[dict[str, Any]]:
     Raises `UserError` where the file is missing, damaged, or no table of a study.
     """
     try:
-        table = pq.read_table(path)
+        with path.open("rb") as file:
+            table = pq.read_table(file)
     except FileNotFoundError:
         raise UserError(f"{path} does not exist: hvt-study run --out {path.parent} writes it") from None
     except (OSError, pa.ArrowException) as error:

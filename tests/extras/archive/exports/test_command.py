@@ -446,6 +446,13 @@ def test_recordings_are_not_joined_into_one_of_them(recording, tmp_path):
     assert source.read_bytes() == recording.read_bytes()
 
 
+@pytest.mark.parametrize("kind", ["mp4", "csv", "parquet", "mcap", "mot"])
+def test_a_name_that_is_no_text_is_a_name(recording, tmp_path, kind):
+    """A file off another system ended the export with a traceback."""
+    out = tmp_path / os.fsdecode(b"fl\xffight")
+    assert export(recording, out, "--to", kind).stat().st_size > 0
+
+
 def test_a_name_that_nobody_gave_is_never_taken_from_another_export(tmp_path):
     """Two exports of one recording at once: the table of the first would be gone."""
     out = tmp_path / "flight.csv"
