@@ -53,7 +53,7 @@ def requested_host(header: str) -> str:
 def with_small_scheme(url: str) -> str:
     """The same address: RFC 3986, 3.1, knows no capitals in a scheme, and FFmpeg and pytak take none."""
     scheme, mark, rest = url.partition("://")
-    return f"{scheme.lower()}{mark}{rest}"
+    return f"{scheme.lower()}{mark}{rest}" if mark else url
 
 
 def host_and_port(address: str, *, name: str, example: str) -> tuple[str, int]:

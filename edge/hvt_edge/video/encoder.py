@@ -136,7 +136,7 @@ def encoder_settings(
     nothing can yield: the VBV is made tighter and the target lowered by the peak that is left. Where a window of
     ``window_s`` holds no whole number of frames, the target is lowered until it holds all that fall into it.
 
-    ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds one at least.
+    ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds more than one.
     """
     tight = base_bps * _PEAK > total_bps
     line_bps = min(base_bps, total_bps / _TIGHT_PEAK) if tight else base_bps
@@ -226,9 +226,9 @@ class CheckedEncoder:
         assert not regions, "config.check() refuses regions with another encoder than x265"
         unit = self._encoder.encode(frame, keyframe=keyframe)
         data = getattr(unit, "data", None)
-        if not isinstance(data, bytes) or not data:
+        data = without_filler(data) if isinstance(data, bytes) else b""
+        if not data:
             raise ValueError(f"it gave no access unit for frame {frame.index}, and has to give one for each")
-        data = without_filler(data)
         # To begin a decoder with it takes both; another I picture is a large frame like any other.
         begins = is_keyframe(data) and bool(parameter_sets(data))
         if (keyframe or not self._begun) and not begins:

@@ -5,7 +5,8 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
 * A VBV of 0.15 s keeps the run within 1.02 and each rolling second within 1.14 of the target from 300 kbps up,
   on-demand keyframes included; with 0.2 s a keyframe on demand reaches 1.18. x265 leaves up to 40 % of the rate
   unused after a keyframe of a still scene (``strict-cbr`` only fills that up with filler): `SpareRate` uses it.
-* ``keyint=-1``: no keyframe comes by itself. The edge asks for each one, so that stills can yield to it.
+* ``keyint=-1``: no keyframe comes by itself. The edge asks for each one, so that stills can yield to it. x265 is
+  opened anew for it, in 2 ms: it never forgets what earlier scenes took, and its keyframe of a still one had QP 51.
 * ``pools``: with several worker threads the row-level rate control sees a different order of rows each run, and the
   same input gives other bytes. Lockstep therefore uses one; real time uses what there is, which halves the time of a
   frame on two cores (keyframes 151 to 81 ms, others 23 to 13).
@@ -15,8 +16,8 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
   stays a plain I frame that nobody can start at; ``repeat-headers=1`` puts the parameter sets before an IDR.
 * ``info=0``: else each keyframe carries x265's settings as text, 2.4 kB.
 * BT.709 limited range, signalled: viewers assume it for HD.
-* Each picture carries regions of interest (`RegionTagger`). Without any region the bytes are the same as without, the
-  two fastest presets apart.
+* Each picture carries regions of interest (`RegionTagger`). An offset of 0 changes no byte, but in the two fastest
+  presets.
 """
 
 from __future__ import annotations
@@ -184,15 +185,13 @@ class SpareRate:
     x265 follows a scene slowly: a keyframe is as coarse as the VBV makes it, and after it the picture of a still
     camera would get better for five seconds while a third of the rate, and more, is left unused. So each frame whose
     rest does not fit into the VBV makes the next ones finer. x265 knows nothing of it but the bits that it takes, and
-    keeps its VBV as ever.
+    keeps its VBV, but for the first frames where a still scene begins to move.
     """
 
     _STEPS_PER_FRAME = 5.0
     """For a frame that has used none of its share."""
     _DECAY = 0.985
     """Of the steps, by the next frame: what is no longer needed goes."""
-    _AFTER_KEYFRAME = 0.5
-    """Of the steps; the keyframe itself has none."""
     _MOST_STEPS = 24.0
 
     def __init__(self, settings: EncoderSettings) -> None:
@@ -203,16 +202,16 @@ class SpareRate:
 
     @property
     def steps(self) -> int:
-        """Of the next frame, unless it is a keyframe."""
+        """Of the next frame; 0 for the first, which is a keyframe."""
         return round(self._steps)
 
-    def coded(self, size_bytes: int, *, keyframe: bool) -> None:
+    def coded(self, size_bytes: int) -> None:
         """A frame took so much."""
         self._free_bits = max(0.0, self._free_bits - 8 * size_bytes) + self._frame_bits
         lost_bits = max(0.0, self._free_bits - self._depth_bits)
         self._free_bits -= lost_bits
         finer = self._DECAY * self._steps + self._STEPS_PER_FRAME * lost_bits / self._frame_bits
-        self._steps = min(self._MOST_STEPS, self._AFTER_KEYFRAME * self._steps if keyframe else finer)
+        self._steps = min(self._MOST_STEPS, finer)
 
 
 _QP_STEPS = 51
@@ -228,14 +227,15 @@ class BaseEncoder:
         # Never `av.logging.set_level`: it makes a decoder's worker that logs wait for the GIL, while the thread that
         # closes that decoder holds the GIL and waits for the worker. PyAV is silent by default.
         self._to_yuv = VideoReformatter()
-        self._workers = NewThreads()
+        self._settings, self._workers = settings, NewThreads()
         self._spent = (0, 0)
         """Once it is closed."""
-        with self._workers:
-            self._context: VideoCodecContext | None = _open(settings)
-        self._tagger, self._spare = RegionTagger(), SpareRate(settings)
+        self._context: VideoCodecContext | None = None
+        self._tagger = RegionTagger()
         self._count = 0
-        self._caller_ns = self._wall_ns = 0
+        self._caller_ns = self._wall_ns = self._ended_ns = 0
+        """Processor time of the calling thread, time by the clock, and processor time of workers that have ended."""
+        self._open()
         self.mean_qp = math.nan
         """Of the frame encoded last: the quantiser parameter (0…51), averaged over its blocks."""
 
@@ -246,16 +246,20 @@ class BaseEncoder:
         """
         assert self._context is not None, "it is open"
         began_ns, began_cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
+        if keyframe and self._count:
+            self._ended_ns += self._workers.cpu_ns or 0
+            self._context = None  # its memory goes first
+            self._open()
         picture = yuv_picture(self._to_yuv, frame.base_bgr)
-        finer = 0 if keyframe else self._spare.steps
-        picture = self._tagger.tag(picture, regions, whole=-finer / _QP_STEPS)
+        picture = self._tagger.tag(picture, regions, whole=-self._spare.steps / _QP_STEPS)
         picture.pts = self._count
         picture.pict_type = PictureType.I if keyframe else PictureType.NONE
         self._count += 1
+        assert self._context is not None, "it is open"
         (packet,) = self._context.encode(picture)  # zero latency: one in, one out
         if packet.is_keyframe:  # the first is one, and by then each worker has lowered its priority
             self._workers.raise_priority()
-        self._spare.coded(packet.size, keyframe=packet.is_keyframe)
+        self._spare.coded(packet.size)
         self.mean_qp = mean_qp_of(packet)
         self._caller_ns += time.thread_time_ns() - began_cpu_ns
         self._wall_ns += time.perf_counter_ns() - began_ns
@@ -272,12 +276,19 @@ class BaseEncoder:
         if self._context is None:
             return self._spent
         workers_ns = self._workers.cpu_ns
-        return self._wall_ns if workers_ns is None else self._caller_ns + workers_ns, self._count
+        if workers_ns is None:
+            return self._wall_ns, self._count
+        return self._caller_ns + self._ended_ns + workers_ns, self._count
 
     def close(self) -> None:
         """End x265's threads, and give back its memory: 12.5 MB for each of some frames of 1280x720."""
         self._spent = self.spent
         self._context, self._tagger = None, RegionTagger()
+
+    def _open(self) -> None:
+        with self._workers:
+            self._context = _opened(self._settings)
+        self._spare = SpareRate(self._settings)
 
 
 def yuv_picture(
@@ -315,7 +326,7 @@ def encoder_context(name: str) -> VideoCodecContext:
     return context
 
 
-def _open(settings: EncoderSettings) -> VideoCodecContext:
+def _opened(settings: EncoderSettings) -> VideoCodecContext:
     kbps = max(1, settings.bitrate_bps // 1000)
     parameters = {
         "keyint": -1,

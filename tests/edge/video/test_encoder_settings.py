@@ -69,7 +69,7 @@ def test_video_alone_stays_within_the_total():
     """In M0 there are no stills that could yield: each burst would make the picture late."""
     bits = line_bits(hard_pictures(60, size=SIZE), asked(250_000, 250_000))
     assert fullest_second(bits) <= 1.08 * 250_000
-    assert sum(bits) / 4 >= 0.78 * 250_000
+    assert sum(bits) / 4 >= 0.74 * 250_000
 
 
 def test_headers_and_status_are_taken_off_the_target():
@@ -110,7 +110,7 @@ def test_fewer_frames_leave_more_for_each_and_keep_the_share(decimation):
         size=SIZE, fps=fps, preset="veryfast", total_bps=150_000, base_bps=120_000, edge_id="edge-1"
     )
     assert settings.bitrate_bps > asked(120_000, 150_000).bitrate_bps + 3_000
-    assert settings.vbv_s * fps >= 0.999, "x265 takes no VBV that holds less than a frame"
+    assert settings.vbv_s * fps >= 1.1, "with a VBV of one frame x265 leaves a third of the rate unused"
     pictures = hard_pictures(210, size=SIZE)[::decimation]
     encoder = BaseEncoder(settings)
     payload = sum(len(encoder.encode(frame).data) for frame in framed(pictures, fps=fps))
