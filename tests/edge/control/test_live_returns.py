@@ -14,7 +14,7 @@ from rigs.live_flight import LiveFlight, SteppedLink
 
 SIZES = ((1920, 1080), (1280, 720), (640, 360), (320, 180), (96, 64))
 BACK_S = 3.0
-RATE_BACK_S = 5.0
+RATE_BACK_S = 6.0
 M0, M6 = {"method": "M0"}, {"method": "M6", "video_share": 0.85}
 
 
