@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 from hvt_edge.source.contract import size_within
 from hvt_study.runs.spec import MATCH_TOLERANCE
@@ -23,7 +24,10 @@ _CLOSE = 0.003
 """Of the target on the grid: with half a step it stays within one per cent of the real one."""
 SAME_TOTAL = 1e-4
 """Of a total: rates that come back from another accounting are rounded."""
-_TRIES = 7
+_TRIES = 12
+_ASIDE = 0.004
+"""Of a budget: so far beside the best one the next is tried, where the curve has a step or falls. x265 takes whole
+kbps, and what it leaves of them depends on each frame."""
 _USUAL_RATIO = 0.98
 """What a video-only method spends of the budget that it is given."""
 
@@ -55,14 +59,14 @@ def match(spends: Callable[[int], float | None], *, target_bps: float) -> Matche
     """Find a budget for which ``spends(budget_bps)`` is close to the grid's target (of ``target_bps``).
 
     The search is a secant in the logarithms of both, kept within what has been seen to be too much and too little;
-    ``spends`` is asked seven times at most. It may jump: the nearest that was seen is returned, whether or not it is
+    ``spends`` is asked twelve times at most. It may jump: the nearest that was seen is returned, whether or not it is
     within the tolerance. ``spends`` is None for a budget that cannot be flown, which ends the search: None where that
     is the first one.
     """
     target = grid_target(target_bps)
     seen: dict[int, float] = {}
     budget = first_budget(target_bps)
-    while len(seen) < _TRIES and budget not in seen:
+    while len(seen) < _TRIES:
         total = spends(budget)
         if total is None:
             break
@@ -70,6 +74,8 @@ def match(spends: Callable[[int], float | None], *, target_bps: float) -> Matche
         if abs(seen[budget] / target - 1) <= _CLOSE:
             break
         budget = _next(seen, target)
+        if budget in seen:
+            budget = _beside(seen, target)
     if not seen:
         return None
     best = min(seen, key=lambda one: abs(seen[one] / target_bps - 1))
@@ -86,6 +92,15 @@ def _next(seen: dict[int, float], target: float) -> int:
     share = math.log(target / seen[low]) / span if span > 0 else 0.5
     # Never right at an end: where the curve is a step, that end would be tried again and again.
     return round(low * math.pow(high / low, min(max(share, 0.1), 0.9)))
+
+
+def _beside(seen: dict[int, float], target: float) -> int:
+    best = min(seen, key=lambda one: abs(seen[one] / target - 1))
+    side = -1 if seen[best] > target else 1
+    step = max(1, round(_ASIDE * best))
+    return next(
+        one for k in count(1) for one in (best + side * k * step, best - side * k * step) if one not in seen
+    )
 
 
 _BOXES = ((640, 360), (960, 540), (1280, 720), (1920, 1080), (2560, 1440), (3840, 2160))
