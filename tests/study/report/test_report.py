@@ -93,7 +93,7 @@ def test_what_was_there_stays_until_the_new_table_is_whole(tmp_path, monkeypatch
     write_results([row("a", "M0", 1, 0.5)], path)
 
     def full(table, where, **_):
-        where.write_bytes(b"PAR1 half a table")
+        where.write(b"PAR1 half a table")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(pq, "write_table", full)

@@ -17,7 +17,7 @@ from media.onnx_models import colour_detector
 from programs.processes import eventually
 
 SIZE = (160, 96)
-REGIME = "100kbps"
+REGIME = "80kbps"
 """So much that the share that DDS spends of it is still what this picture needs at the least."""
 _MAIN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"  # a shell's background job ignores it
