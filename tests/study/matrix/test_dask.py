@@ -10,11 +10,11 @@ from contextlib import ExitStack
 import pytest
 
 from programs.processes import PATIENT_S, eventually, free_ports
-from studies.small_study import REGIME, arguments, detector, flights, holding, said, study, table, until
+from studies.small_study import arguments, detector, flights, holding, said, study, table, until
 
 pytest.importorskip("distributed")
 pytestmark = pytest.mark.nightly
-WORDS = ("--methods", "M0,R0,M5", "--regimes", REGIME)
+WORDS = ("--methods", "M0,R0,M5", "--regimes", "100kbps")
 
 
 class Cluster:

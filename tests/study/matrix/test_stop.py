@@ -14,7 +14,7 @@ from studies.small_study import REGIME, arguments, entries, flights, said, study
 
 pytestmark = pytest.mark.nightly
 
-METHODS = ("--methods", "M0,R0,M5", "--regimes", REGIME)
+METHODS = ("--methods", "M0,R0,M5", "--regimes", "100kbps")
 
 
 @pytest.mark.parametrize("full_for", ["detections", "flights"])
