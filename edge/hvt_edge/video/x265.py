@@ -195,8 +195,8 @@ class SpareRate:
     _MOST_STEPS = 24.0
 
     def __init__(self, settings: EncoderSettings) -> None:
-        self._frame_bits = settings.bitrate_bps / settings.fps
-        self._depth_bits = settings.bitrate_bps * settings.vbv_s
+        kbps, depth_kbit = _whole(settings)
+        self._frame_bits, self._depth_bits = 1000 * kbps / settings.fps, 1000.0 * depth_kbit
         self._free_bits = 0.9 * self._depth_bits  # x265's ``vbv-init``
         self._steps = 0.0
 
@@ -244,18 +244,17 @@ class BaseEncoder:
 
         Where ``regions`` overlap the deeper one counts.
         """
-        assert self._context is not None, "it is open"
         began_ns, began_cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         if keyframe and self._count:
             self._ended_ns += self._workers.cpu_ns or 0
             self._context = None  # its memory goes first
             self._open()
+        assert self._context is not None, "it is open"
         picture = yuv_picture(self._to_yuv, frame.base_bgr)
         picture = self._tagger.tag(picture, regions, whole=-self._spare.steps / _QP_STEPS)
         picture.pts = self._count
         picture.pict_type = PictureType.I if keyframe else PictureType.NONE
         self._count += 1
-        assert self._context is not None, "it is open"
         (packet,) = self._context.encode(picture)  # zero latency: one in, one out
         if packet.is_keyframe:  # the first is one, and by then each worker has lowered its priority
             self._workers.raise_priority()
@@ -326,8 +325,14 @@ def encoder_context(name: str) -> VideoCodecContext:
     return context
 
 
-def _opened(settings: EncoderSettings) -> VideoCodecContext:
+def _whole(settings: EncoderSettings) -> tuple[int, int]:
+    # Rate and depth of the VBV as x265 takes them: kilobits a second, and kilobits.
     kbps = max(1, settings.bitrate_bps // 1000)
+    return kbps, max(1, round(kbps * settings.vbv_s))
+
+
+def _opened(settings: EncoderSettings) -> VideoCodecContext:
+    kbps, depth_kbit = _whole(settings)
     parameters = {
         "keyint": -1,
         "min-keyint": 1,
@@ -337,7 +342,7 @@ def _opened(settings: EncoderSettings) -> VideoCodecContext:
         "repeat-headers": 1,
         "open-gop": 0,
         "vbv-maxrate": kbps,
-        "vbv-bufsize": max(1, round(kbps * settings.vbv_s)),
+        "vbv-bufsize": depth_kbit,
         "pools": settings.threads,
         "frame-threads": 1,
         "colorprim": "bt709",

@@ -54,29 +54,26 @@ def hota(frames: Sequence[tuple[IdBoxes, IdBoxes]]) -> float:
         for (true, true_boxes), (shown, boxes) in frames
         if len(true) and len(shown)
     ]
-    met = [overlap.nonzero() for _, _, overlap in overlaps]
-    shares = [np.empty(0)]
-    for (_, _, overlap), (rows, columns) in zip(overlaps, met, strict=True):
-        rest = overlap.sum(axis=0)[columns] + overlap.sum(axis=1)[rows] - overlap[rows, columns]
+    overlaps = [one for one in overlaps if one[2].any()]
+    pairs, shares = [np.empty(0, np.int64)], [np.empty(0)]
+    for true, shown, overlap in overlaps:
+        rows, columns = overlap.nonzero()
         share = overlap[rows, columns]
+        rest = overlap.sum(axis=0)[columns] + overlap.sum(axis=1)[rows] - share
         shares.append(np.divide(share, rest, out=np.zeros_like(share), where=rest > _EPSILON))
-    pairs = [np.empty(0, np.int64)]
-    for (true, shown, _), (rows, columns) in zip(overlaps, met, strict=True):
         pairs.append(true[rows] * len(lengths) + shown[columns])
     known, pair = np.unique(np.concatenate(pairs), return_inverse=True)
     together = np.bincount(pair, np.concatenate(shares), len(known))
     either = true_lengths[known // len(lengths)] + lengths[known % len(lengths)]
     alignment = together / (either - together)
     matched, at, begin = [np.empty(0, np.int64)], [np.empty(0)], 0
-    for (_, _, overlap), (rows, columns) in zip(overlaps, met, strict=True):
+    for _, _, overlap in overlaps:
+        meet = overlap.nonzero()
+        end = begin + len(meet[0])
         numbers = np.zeros(overlap.shape, np.int64)
-        numbers[rows, columns] = pair[begin : begin + len(rows)]
-        begin += len(rows)
-        best = (
-            linear_sum_assignment(alignment[numbers] * overlap, maximize=True)
-            if len(rows)
-            else (rows, columns)
-        )
+        numbers[meet] = pair[begin:end]
+        begin = end
+        best = linear_sum_assignment(alignment[numbers] * overlap, maximize=True)
         matched.append(numbers[best])
         at.append(overlap[best])
     pair = np.concatenate(matched)
