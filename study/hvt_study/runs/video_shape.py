@@ -24,10 +24,11 @@ _CLOSE = 0.003
 """Of the target on the grid: with half a step it stays within one per cent of the real one."""
 SAME_TOTAL = 1e-4
 """Of a total: rates that come back from another accounting are rounded."""
-_TRIES = 12
-_ASIDE = 0.004
-"""Of a budget: so far beside the best one the next is tried, where the curve has a step or falls. x265 takes whole
-kbps, and what it leaves of them depends on each frame."""
+_TRIES, _MORE = 7, 9
+"""Of the secant, and then beside the best budget."""
+_ASIDE, _ASIDE_BPS = 0.004, 1000
+"""Of a budget, and at least: so far beside the best one the next is tried, where the curve has a step or falls. x265
+takes whole kbps, and what it leaves of them depends on each frame."""
 _USUAL_RATIO = 0.98
 """What a video-only method spends of the budget that it is given."""
 
@@ -59,22 +60,25 @@ def match(spends: Callable[[int], float | None], *, target_bps: float) -> Matche
     """Find a budget for which ``spends(budget_bps)`` is close to the grid's target (of ``target_bps``).
 
     The search is a secant in the logarithms of both, kept within what has been seen to be too much and too little;
-    ``spends`` is asked twelve times at most. It may jump: the nearest that was seen is returned, whether or not it is
-    within the tolerance. ``spends`` is None for a budget that cannot be flown, which ends the search: None where that
-    is the first one.
+    ``spends`` is asked sixteen times at most. It may jump, so that between two budgets is none that fits: after seven
+    times those beside the best one are tried, until one is within the tolerance. The nearest that was seen is
+    returned, whether or not it is. ``spends`` is None for a budget that cannot be flown, which ends the search: None
+    where that is the first one.
     """
     target = grid_target(target_bps)
     seen: dict[int, float] = {}
     budget = first_budget(target_bps)
-    while len(seen) < _TRIES:
+    while len(seen) < _TRIES + _MORE:
         total = spends(budget)
         if total is None:
             break
         seen[budget] = total
-        if abs(seen[budget] / target - 1) <= _CLOSE:
+        if abs(total / target - 1) <= _CLOSE:
+            break
+        if len(seen) >= _TRIES and any(within(one, target_bps) for one in seen.values()):
             break
         budget = _next(seen, target)
-        if budget in seen:
+        if len(seen) >= _TRIES or budget in seen:
             budget = _beside(seen, target)
     if not seen:
         return None
@@ -97,7 +101,7 @@ def _next(seen: dict[int, float], target: float) -> int:
 def _beside(seen: dict[int, float], target: float) -> int:
     best = min(seen, key=lambda one: abs(seen[one] / target - 1))
     side = -1 if seen[best] > target else 1
-    step = max(1, round(_ASIDE * best))
+    step = max(_ASIDE_BPS, round(_ASIDE * best))
     return next(
         one for k in count(1) for one in (best + side * k * step, best - side * k * step) if one not in seen
     )
