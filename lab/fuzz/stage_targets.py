@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
-from hvt_common.protocol.messages import ControlRequest, Feedback, WireError
+from hvt_common.protocol.messages import MAX_MISSING_BASE, ControlRequest, Feedback, Flags, WireError
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
+from hvt_ground.link.reassemble import REORDER_UNITS, RESEND_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
 from lab.fuzz.mutate import changed_values, each_part, joined, parted
@@ -20,7 +20,10 @@ from rigs.command_rig import SESSION, Rig
 
 _MS = 1_000_000
 _STEP = struct.Struct("<BbbH")
-"""A base message: session and flags, sequence and frame index against what the last one said, milliseconds."""
+"""A base message: session and flags, sequence and frame index against what the last one said, milliseconds.
+
+An odd number of these: it is sent once more. A byte behind the last: the edge does so.
+"""
 _FAR = (0, 1 << 10, 1 << 31, 1 << 63)
 
 
@@ -30,6 +33,7 @@ class _Header:
     sequence: int
     frame_index: int
     keyframe: bool
+    flags: Flags
 
 
 def _base_messages(data: bytes) -> Iterator[tuple[_Header, int]]:
@@ -37,11 +41,13 @@ def _base_messages(data: bytes) -> Iterator[tuple[_Header, int]]:
     for bits, step, frames, wait_ms in _STEP.iter_unpack(data[: len(data) // _STEP.size * _STEP.size]):
         sequence = max(0, sequence + step + _FAR[bits >> 3 & 3] * (bits >> 7))
         frame_index = max(0, frame_index + frames + _FAR[bits >> 5 & 3] * (bits >> 7))
-        yield _Header(bits & 3, sequence, frame_index, bool(bits & 4)), wait_ms
+        flags = Flags.RESENT if wait_ms % 2 else Flags(0)
+        yield _Header(bits & 3, sequence, frame_index, bool(bits & 4), flags), wait_ms
 
 
 def _reassembly(data: bytes) -> None:
     core: Reassembler = Reassembler()
+    core.round_trip_ns = 60 * _MS if len(data) % _STEP.size else None
     now_ns, last = 5_000 * _MS, None
     for header, wait_ms in _base_messages(data):
         now_ns += wait_ms * _MS
@@ -49,7 +55,8 @@ def _reassembly(data: bytes) -> None:
             last = _checked(arrival, last)
         if core.wants_keyframe(now_ns):
             core.keyframe_requested(now_ns)
-        assert len(core._held) <= REORDER_UNITS
+        assert len(core._held) <= (RESEND_UNITS if core.round_trip_ns else REORDER_UNITS)
+        assert len(core.missing) <= MAX_MISSING_BASE
         assert len(core._left) <= 16
 
 
@@ -71,7 +78,8 @@ def _reassembly_seeds() -> list[bytes]:
     lost = [*whole[:8], _STEP.pack(1, 4, 4, 66), *whole[:4], _STEP.pack(5, 1, 1, 200), *whole[1:9]]
     other = [*whole[:8], _STEP.pack(6, -8, -8, 700), *[_STEP.pack(2, 1, 1, 66)] * 6]
     forged = [*whole[:8], _STEP.pack(0x9D, 1, 1, 66), *whole[1:9], _STEP.pack(5, -100, -100, 2500)]
-    return [b"".join(messages) for messages in (whole, lost, other, forged)]
+    again = [*whole[:8], _STEP.pack(1, 2, 2, 66), _STEP.pack(1, -1, -1, 61), b"!"]
+    return [b"".join(messages) for messages in (whole, lost, other, forged, again)]
 
 
 # The edge's side

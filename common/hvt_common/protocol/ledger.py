@@ -162,15 +162,22 @@ class Ledger:
         self.reply_bytes += line_bytes
 
     def count(
-        self, channel: Account, *, payload_bytes: int, attachment_bytes: int, overhead_bytes: int, at_ns: int
+        self,
+        channel: Account,
+        *,
+        payload_bytes: int,
+        attachment_bytes: int,
+        overhead_bytes: int,
+        at_ns: int,
+        again: bool = False,
     ) -> None:
-        """Add one message; ``at_ns`` is the time that its windows go by."""
+        """Add one message; ``at_ns`` is the time that its windows go by. Of one sent ``again`` only bytes count."""
         self._overhead_bytes += overhead_bytes
         self._bytes[Account.META] += attachment_bytes
         self._bytes[channel] += payload_bytes
         line = payload_bytes + attachment_bytes + overhead_bytes
         self._line[channel] += line
-        self._messages[channel] += 1
+        self._messages[channel] += not again
         self._enter(at_ns, channel, line)
 
     def record_outcome(self, outcome: StillOutcome, reason: str) -> None:

@@ -59,6 +59,9 @@ _SPARE_SHARE = 0.05
 BASE_PEAK = 1.15
 """The fullest window of the base stream over B_v: what the VBV allows, kept also where frames bunch up."""
 
+_MOST_RESENT = 0.25
+"""Share of a window for base messages that go once more: a keyframe at most, or some frames."""
+
 _WHOLE_NS = 2 * SECOND_NS
 """A window of at most so long is back within the three seconds in which live video has to be."""
 
@@ -184,6 +187,8 @@ class RollingBudget:
         """(time, bytes that a still took of what the base had left)."""
         self._used: deque[tuple[int, float]] = deque()
         """(time, bytes that no requested still had) after each base frame of late, where the base does not yield."""
+        self._resent: deque[tuple[int, int]] = deque()
+        """(time, line bytes) of the base messages that went out again in the last window."""
         self._query_ns: int | None = None
         self._last_ns = 0
         self._last_base_ns: int | None = None
@@ -301,6 +306,19 @@ class RollingBudget:
         """
         after_ns = now_ns - self._settings.window_ns
         return line_bytes + sum(size for at_ns, size in self._events if at_ns > after_ns) <= self._total
+
+    def resend_ns(self, line_bytes: int, *, now_ns: int) -> int | None:
+        """Return when a base message may go once more (`earliest_ns`); None beyond the share of such messages."""
+        while self._resent and self._resent[0][0] <= now_ns - self._settings.window_ns:
+            self._resent.popleft()
+        if line_bytes + sum(size for _, size in self._resent) > _MOST_RESENT * self._total:
+            return None
+        return self.earliest_ns(line_bytes, now_ns=now_ns)
+
+    def record_resent(self, line_bytes: int, *, now_ns: int) -> None:
+        """Count one; ``now_ns`` is when `resend_ns` lets it go."""
+        self._resent.append((now_ns, line_bytes))
+        self.record_other(line_bytes, now_ns)
 
     def metadata_fits(self, line_bytes: int, *, now_ns: int, before_frames: bool = False) -> bool:
         """Tell whether a message of neither stream, sent now, leaves the base frames to come their room.

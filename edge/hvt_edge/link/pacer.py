@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from hvt_common.protocol.messages import Feedback
@@ -44,6 +45,8 @@ video at the least rate, since behind a router the link may be gone all the same
 _MEMORY_NS = 15 * SECOND_NS
 """So long, to twice as long, the shortest round trip counts."""
 _MOST_RECORDS = 1024
+_RESEND_NS = SECOND_NS
+"""An access unit that is older is not sent again: a keyframe has been requested by then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,14 +167,17 @@ class Flight:
 
 
 class BaseInFlight:
-    """Access units that were sent and that no report has named; the oldest leaves first. Thread-safe."""
+    """Access units that were sent and that no report has named, or that one misses; the oldest leaves first.
+
+    Thread-safe.
+    """
 
     def __init__(self, *, max_age_ns: int = 4 * SECOND_NS, max_bytes: int = 2 * 2**20) -> None:
         self._max_age_ns = max_age_ns
         self._max_bytes = max_bytes
         self._lock = threading.Lock()
-        self._units: deque[tuple[int, int, AccessUnit]] = deque()
-        """(sequence, time of sending, unit)."""
+        self._units: dict[int, tuple[int, AccessUnit]] = {}
+        """Sequence → time of sending and unit, in order."""
         self.size_bytes = 0
 
     def __len__(self) -> int:
@@ -179,31 +185,47 @@ class BaseInFlight:
 
     def sent(self, sequence: int, unit: AccessUnit, *, now_ns: int) -> None:
         with self._lock:
-            self._units.append((sequence, now_ns, unit))
+            self._units[sequence] = now_ns, unit
             self.size_bytes += len(unit.data)
-            while self._units and (
-                self.size_bytes > self._max_bytes or now_ns - self._units[0][1] > self._max_age_ns
-            ):
-                self._forget()
+            while self._units:
+                oldest = next(iter(self._units))
+                if self.size_bytes <= self._max_bytes and now_ns - self._units[oldest][0] <= self._max_age_ns:
+                    break
+                self._forget(oldest)
 
-    def on_report(self, base_sequence: int) -> bool:
-        """The primary receiver has come as far as this; return whether that is news."""
+    def on_report(self, base_sequence: int, missing: Collection[int] = ()) -> bool:
+        """The primary receiver has come as far as this, without what is ``missing``; whether that is news."""
         with self._lock:
-            before = len(self._units)
-            while self._units and self._units[0][0] <= base_sequence:
-                self._forget()
-            return len(self._units) < before
+            come = [one for one in self._units if one <= base_sequence and one not in missing]
+            for one in come:
+                self._forget(one)
+            return bool(come)
+
+    def missing(self, sequence: int, *, now_ns: int) -> AccessUnit | None:
+        """A unit that is worth sending once more; None where it is too old, or a keyframe was sent since."""
+        with self._lock:
+            sent_ns, unit = self._units.get(sequence, (0, None))
+            newer = (one for at, (_, one) in self._units.items() if at > sequence)
+            if unit is None or now_ns - sent_ns > _RESEND_NS or any(one.keyframe for one in newer):
+                return None
+            return unit
+
+    def resent(self, sequence: int) -> None:
+        """It goes out again, and not a third time."""
+        with self._lock:
+            if sequence in self._units:
+                self._forget(sequence)
 
     def take(self) -> list[AccessUnit]:
         """Return and forget all that may be lost, in order."""
         with self._lock:
-            units = [unit for _, _, unit in self._units]
+            units = [unit for _, unit in self._units.values()]
             self._units.clear()
             self.size_bytes = 0
         return units
 
-    def _forget(self) -> None:
-        self.size_bytes -= len(self._units.popleft()[2].data)
+    def _forget(self, sequence: int) -> None:
+        self.size_bytes -= len(self._units.pop(sequence)[1].data)
 
 
 class Pacer:

@@ -6,7 +6,7 @@ Base first, then metadata, stills by utility, the backlog. Five threads send:
 * the stills' thread: `tracks` and `still`;
 * that of requested stills: `still`;
 * the store's thread: `backlog`;
-* the link's callbacks: `reply`, what grounds asked of ``info`` and ``control``.
+* the link's callbacks: `reply`, what grounds asked of ``info`` and ``control``, and `resend`, what one misses.
 
 The lock covers header, ledger and budget, never a wait or a ``put``. So a still whose ``put`` blocks holds up stills
 alone; a base frame finds the lock free and a publisher of its own.
@@ -18,7 +18,7 @@ same windows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Protocol
 
@@ -50,6 +50,7 @@ BACKLOG_ATTACHMENT_BYTES = 48
 LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
 """A chunk occupies the link so long at most, so a frame or a live still need not wait for it."""
+_RESEND_WAIT_NS = 150_000_000
 _GROWTH_BYTES = 16
 """Growth of a message that is made for a later moment: its two times."""
 
@@ -122,14 +123,7 @@ class Transmitter:
                 return 0
             at_ns = self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
             self.base_sequence += 2 if after_hole else 1
-            header = BaseHeader(
-                session_id=self.session_id,
-                sequence=self.base_sequence,
-                frame_index=unit.frame_index,
-                capture_ns=unit.capture_ns,
-                send_delay_ns=at_ns - unit.capture_ns,
-                flags=self._flags | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0),
-            )
+            header = self._base_header(self.base_sequence, unit, at_ns=at_ns)
             attachment = header.pack(unit.data)
             self._captures.note(header)
             line_bytes = self._count(Channel.BASE, Account.BASE, unit.data, attachment, at_ns=at_ns)
@@ -143,6 +137,48 @@ class Transmitter:
             Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
         )
         return line_bytes
+
+    def _base_header(
+        self, sequence: int, unit: AccessUnit, *, at_ns: int, resent: bool = False
+    ) -> BaseHeader:
+        start = Flags.KEYFRAME | Flags.PARAMETER_SETS if unit.keyframe else 0
+        return BaseHeader(
+            session_id=self.session_id,
+            sequence=sequence,
+            frame_index=unit.frame_index,
+            capture_ns=unit.capture_ns,
+            send_delay_ns=at_ns - unit.capture_ns,
+            flags=self._flags | start | (Flags.RESENT if resent else 0),
+        )
+
+    def resend(self, missing: Sequence[int], *, now_ns: int) -> None:
+        """Send access units that the primary receiver misses once more, before those that are yet to come.
+
+        What has no room in the budget's window within `_RESEND_WAIT_NS`, or is beyond the share of such messages, may
+        go at the next report.
+        """
+        for sequence in () if self.lockstep else missing:
+            with self._lock:
+                unit = self.in_flight.missing(sequence, now_ns=now_ns)
+                if unit is None:
+                    continue
+                line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
+                at_ns = self.budget.resend_ns(line_bytes, now_ns=now_ns)
+                if at_ns is None or at_ns - now_ns > _RESEND_WAIT_NS:
+                    continue
+                header = self._base_header(sequence, unit, at_ns=at_ns, resent=True)
+                attachment = header.pack(unit.data)
+                line_bytes = self._count(
+                    Channel.BASE, Account.BASE, unit.data, attachment, at_ns=at_ns, again=True
+                )
+                self.budget.record_resent(line_bytes, now_ns=at_ns)
+                if self.pacer is not None:
+                    self.pacer.sent_other(line_bytes, now_ns=at_ns)
+                self.in_flight.resent(sequence)
+            self.wait_until(at_ns)
+            self.outlet.put(
+                Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
+            )
 
     def still_allowance_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
         """Payload that a still with the header of this one may take now, whatever data it holds itself.
@@ -399,6 +435,7 @@ class Transmitter:
         *,
         at_ns: int,
         encoding: str = "",
+        again: bool = False,
     ) -> int:
         line_bytes = self._line_bytes(channel, payload, len(attachment), encoding=encoding)
         self.ledger.count(
@@ -407,6 +444,7 @@ class Transmitter:
             attachment_bytes=len(attachment),
             overhead_bytes=line_bytes - len(payload) - len(attachment),
             at_ns=at_ns,
+            again=again,
         )
         return line_bytes
 

@@ -293,7 +293,7 @@ class LinkControl:
             self.pacer.on_report(report)
             self.keyframes.note_round_trip(self.pacer.round_trip_ns)
         if report.primary:
-            self.transmitter.in_flight.on_report(feedback.base_sequence)
+            self.transmitter.in_flight.on_report(feedback.base_sequence, feedback.missing_base)
             self.stills.outbox.on_report(
                 report.feedback.still_sequence,
                 report.feedback.missing_stills,
@@ -302,8 +302,10 @@ class LinkControl:
             )
         if self.backlog is not None:
             self.backlog.on_feedback(feedback, now_ns=now_ns)
-        # Last: who waits there for the end goes on to store what is not acknowledged.
+        # Late: who waits there for the end goes on to store what is not acknowledged.
         self.inbox.on_report(report)
+        if report.primary:
+            self.transmitter.resend(feedback.missing_base, now_ns=now_ns)
 
 
 def wait_for_ground(

@@ -4,12 +4,15 @@ After one lost P frame an HEVC decoder shows nothing, or garbage, until the next
 nobody. So the rule is strict: the decoder gets runs that start with a keyframe and have no hole, in order,
 each unit once. Everything else is skipped and counted, and `Reassembler.wants_keyframe` says when to ask.
 
-Three things are decided here:
+Four things are decided here:
 
 *Reordering.* Zenoh keeps the order of a key on one link; on several links a unit may come late. A hole counts as lost
 when it is twice as old as any was whose unit came late: at once where none of `ORDERLY_UNITS` was. At most
 `REORDER_WAIT_NS`, and `REORDER_UNITS` units, are waited for. A keyframe never waits: what is missing before it no
 longer matters.
+
+*Repair.* An edge that is told what is `missing` sends it again, and a hole waits for that: a round trip and some, or
+as long as it took of late. A link on which nothing comes again has no such wait after three holes.
 
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
@@ -30,7 +33,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
-from hvt_common.protocol.messages import BaseHeader
+from hvt_common.protocol.messages import MAX_MISSING_BASE, BaseHeader, Flags
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 
@@ -42,6 +45,12 @@ its numbers cannot be true."""
 
 REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
+RESEND_UNITS, RESEND_WAIT_NS = 24, 700_000_000
+"""So many units, and so long, wait at most behind a hole that the edge was told of."""
+_RESEND_SLACK_NS = 120_000_000
+"""Beyond the round trip: a resent unit waits for its report, and behind what the link already holds."""
+_UNANSWERED = 3
+"""After so many holes in a row for which nothing came again no other waits."""
 ORDERLY_UNITS = 30
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
@@ -85,6 +94,8 @@ class StreamCounters:
     """Holes in the sequence that were given up."""
     lost: int = 0
     """Units missing in those holes."""
+    resent: int = 0
+    """Units that were lost, and came when the edge sent them again."""
     duplicates: int = 0
     replayed: int = 0
     """Verdict stale: late or replayed."""
@@ -100,6 +111,8 @@ class Reassembler(Generic[T]):
     """
 
     def __init__(self) -> None:
+        self.round_trip_ns: int | None = None
+        """To the edge and back, for what it resends; None where nobody asks it to."""
         self.counters = StreamCounters()
         self._session: int | None = None
         self._adopted_ns: int | None = None
@@ -121,6 +134,8 @@ class Reassembler(Generic[T]):
         self._unshown = False  # something came since the last progress that could not be used
         self._hole_ns = 0  # when the newest hole that was given up was first seen
         self._late_ns = 0  # how old a hole ever was when its unit came
+        self._resend_ns = 0  # how old one is of late when the unit comes that was sent again
+        self._unanswered = 0  # holes since then that were given up
         self._taken = 0
         self._quiet_until_ns = 0  # no request goes before
         self._requested_ns = self._answer_ns = (
@@ -142,7 +157,7 @@ class Reassembler(Generic[T]):
                 patience_ns=DUPLICATE_SILENCE_NS if duplicate else min(patience_ns, DUPLICATE_SILENCE_NS),
                 duplicate=duplicate,
             )
-        self._note_late(header.sequence, now_ns)
+        self._note_late(header, now_ns)
         if self._first <= header.sequence < self._next or header.sequence in self._held:
             if now_ns - self._progress_ns < RESTART_SILENCE_NS or self._has_been(header.sequence):
                 return [self._judged(unit, "duplicate" if self._has_been(header.sequence) else "stale")]
@@ -151,6 +166,19 @@ class Reassembler(Generic[T]):
             return self._accept_outsider(unit, "implausible", patience_ns=RESTART_SILENCE_NS)
         self._held[header.sequence] = unit
         return self.overdue(now_ns=now_ns)
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """The sequences behind which newer units wait; none where they are too many to be sent again."""
+        newest = max(self._held, default=self._next - 1)
+        if newest + 1 - self._next - len(self._held) > MAX_MISSING_BASE:
+            return ()
+        return tuple(one for one in range(self._next, newest) if one not in self._held)
+
+    @property
+    def newest_held(self) -> Arrival[T] | None:
+        """The newest unit that waits behind a hole."""
+        return self._held[max(self._held)] if self._held else None
 
     def corrupt(self) -> None:
         """Count a message of the base stream that could not be read or whose CRC was wrong."""
@@ -195,10 +223,7 @@ class Reassembler(Generic[T]):
     # Within the session: a hole waits, then is given up.
 
     def overdue(self, *, now_ns: int) -> list[Arrival[T]]:
-        """What need not wait any longer behind a hole, where at most ``REORDER_UNITS`` units do.
-
-        Until it counts as received the edge holds its next frames, and with them what would end the wait.
-        """
+        """What need not wait any longer behind a hole, where at most `REORDER_UNITS` units do, or `RESEND_UNITS`."""
         released: list[Arrival[T]] = []
         keyframe = max(
             (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1
@@ -209,11 +234,12 @@ class Reassembler(Generic[T]):
             if (
                 lost
                 and first > keyframe
-                and len(self._held) <= REORDER_UNITS
+                and len(self._held) <= (RESEND_UNITS if self._resend_wait_ns else REORDER_UNITS)
                 and self._hole_age_ns(now_ns) < self._patience_ns
             ):
                 break
             if lost:
+                self._unanswered += first > keyframe and self._resend_wait_ns > 0
                 self._give_up(lost, now_ns)
             verdict = self._take(unit := self._held.pop(first), now_ns)
             released.append(self._judged(unit, verdict, lost_before=lost))
@@ -232,6 +258,7 @@ class Reassembler(Generic[T]):
         self._recent = (self._recent << 1 | 1) & _WINDOW_MASK
         self._next = header.sequence + 1
         self._taken += 1
+        self.counters.resent += bool(header.flags & Flags.RESENT)
         if header.frame_index <= self._last_frame:  # two units that waited contradict each other
             self._synced = False
             return "implausible"
@@ -258,10 +285,19 @@ class Reassembler(Generic[T]):
 
     @property
     def _patience_ns(self) -> int:
-        return REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
+        usual_ns = REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
+        return max(usual_ns, self._resend_wait_ns)
 
-    def _note_late(self, sequence: int, now_ns: int) -> None:
+    @property
+    def _resend_wait_ns(self) -> int:
+        # How long the present hole waits for what the edge sends again.
+        if self.round_trip_ns is None or self._unanswered >= _UNANSWERED or not self.missing:
+            return 0
+        return min(RESEND_WAIT_NS, max(self.round_trip_ns + _RESEND_SLACK_NS, 5 * self._resend_ns // 4))
+
+    def _note_late(self, header: BaseHeader, now_ns: int) -> None:
         # The unit of a hole comes after all, before or after that was given up.
+        sequence = header.sequence
         if self._held and self._next <= sequence < max(self._held) and sequence not in self._held:
             late_ns = self._hole_age_ns(now_ns)
         elif max(self._first, self._next - SEQUENCE_SLACK) <= sequence < self._next and not self._has_been(
@@ -270,7 +306,10 @@ class Reassembler(Generic[T]):
             late_ns = now_ns - self._hole_ns
         else:
             return
-        self._late_ns = max(self._late_ns, late_ns)
+        if header.flags & Flags.RESENT:
+            self._resend_ns, self._unanswered = max(late_ns, 7 * self._resend_ns // 8), 0
+        else:
+            self._late_ns = max(self._late_ns, late_ns)
 
     # Between sessions.
 

@@ -118,6 +118,8 @@ class Reception:
         self._lock = threading.Lock()
         """Of all below."""
         self._base_sequence = self._still_sequence = self._last_still = -1
+        self._missing_base: tuple[int, ...] = ()
+        """What the newest of ``base`` wait for."""
         self._from_start = False
         self._missing: Newest[int, int] = Newest(MAX_MISSING_STILLS)
         """Sequence → when it was first missed."""
@@ -150,6 +152,18 @@ class Reception:
                     max(0.0, (at_ns - self.capture_clock.to_local_ns(header.capture_ns)) / _MS)
                 )
             self._arrive(item)
+
+    def note_waiting(self, missing: tuple[int, ...], newest: BaseHeader | None, *, at_ns: int) -> bool:
+        """Access units wait behind what is ``missing``, ``newest`` since ``at_ns``; whether anything is news there.
+
+        They count as received: until its frames do, the edge holds the next ones.
+        """
+        with self._lock:
+            news = not set(missing) <= set(self._missing_base)
+            self._missing_base = missing
+            if newest is not None and newest.sequence > self._base_sequence:
+                self._base_sequence, self._arrived_ns, self._news = newest.sequence, at_ns, True
+            return news
 
     def still(self, header: RoiHeader, item: Received) -> bool:
         """Whether a still is to be shown; a second one of the same number is but counted, a third ignored."""
@@ -373,12 +387,13 @@ class Reception:
                 base_bytes=self.ledger.base_bytes,
                 roi_messages=self.stills,
                 roi_bytes=self.ledger.roi_bytes,
-                lost=self.counters.lost,
+                lost=self.counters.lost + self.counters.resent,
                 corrupt=self.counters.corrupt,
                 base_sequence=self._base_sequence,
                 base_held_us=min(held_us, _HELD_US),
                 still_sequence=self._still_sequence,
                 missing_stills=tuple(self._missing),
+                missing_base=self._missing_base,
                 stills=results,
                 delay_p50_ms=min(statistics.median(delays), _MOST_DELAY_MS) if delays else -1.0,
                 **of_receiver,

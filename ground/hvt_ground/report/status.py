@@ -91,6 +91,7 @@ def summary(session: Session) -> dict[str, Any]:
         "detections_run": pipeline.detections_run,
         "gaps": counters.gaps,
         "lost": counters.lost,
+        "resent": counters.resent,
         "corrupt": counters.corrupt,
         "duplicates": counters.duplicates + counters.replayed,
         "keyframe_requests": counters.keyframe_requests,

@@ -164,6 +164,15 @@ class EdgeSessions:
         """Take one message; raises whatever goes wrong with it."""
         for packet in self.receiver.receive(item):
             self._route(packet)
+        if self.session is not None:
+            self._note_waiting(self.session)
+
+    def _note_waiting(self, session: Session) -> None:
+        # What is missing is said at once: each moment more is one without a picture.
+        missing, newest = self.receiver.stream.missing, self.receiver.stream.newest_held
+        header, at_ns = (None, 0) if newest is None else (newest.header, newest.message.received_ns)
+        if session.reception.note_waiting(missing, header, at_ns=at_ns):
+            session.report()
 
     def close(self) -> None:
         """End the session that is open, and close the recordings of former ones."""
@@ -201,6 +210,10 @@ class EdgeSessions:
             session.report_backlog()
         session.report_if_due()
         self._refresh_clock(session, now_ns)
+        clock = None if session.lockstep else self._clock_offset.estimate
+        self.receiver.stream.round_trip_ns = (
+            None if clock is None else 2 * clock[1]
+        )  # its error is half of one
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
             self._end_session()

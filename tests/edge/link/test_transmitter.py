@@ -125,6 +125,56 @@ def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
     return replace(known, sent=counts, deferred=counts, dropped=counts, failed=(), levers="")
 
 
+def send_units(rig, *keyframes: int, until: int, size: int = 1_000) -> int:
+    """So many, 66 ms apart; when the next is due."""
+    for index in range(until):
+        now_ns = NOW_NS + 66_000_000 * index
+        rig.sender.base(unit(index, size, keyframe=index in keyframes), now_ns=now_ns)
+    return NOW_NS + 66_000_000 * until
+
+
+def test_what_a_ground_misses_goes_once_more_as_it_was():
+    """A lost frame would cost all those behind it, up to the next keyframe."""
+    rig = Rig()
+    now_ns = send_units(rig, 0, until=6)
+    rig.sender.in_flight.on_report(5, (2, 3))
+    rig.sender.resend((2, 3), now_ns=now_ns)
+    rig.sender.resend((2, 3, 9), now_ns=now_ns + 1)
+    assert len(rig.out.puts) == 8, "a second time is of no use, and what was never sent is nowhere"
+    assert [one.sequence for one in rig.out.base[6:]] == [2, 3]
+    for header in rig.out.base[6:]:
+        assert header.flags == Flags.RESENT
+        assert (header.frame_index, header.send_ns) == (header.sequence, now_ns)
+    ledger = rig.sender.ledger
+    assert ledger.messages(Account.BASE) == 6, "a ground that has all has so many"
+    assert ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
+    assert len(rig.sender.in_flight) == 0
+
+
+@pytest.mark.parametrize("why", ["a keyframe since", "too old", "lockstep"])
+def test_what_is_of_no_use_does_not_go_again(why):
+    """It would take the bits of pictures that are shown."""
+    rig = Rig(lockstep=why == "lockstep")
+    now_ns = send_units(rig, *((0, 5) if why == "a keyframe since" else (0,)), until=6)
+    rig.sender.resend((3,), now_ns=now_ns + (SECOND_NS if why == "too old" else 0))
+    assert len(rig.out.puts) == 6
+
+
+def test_repetitions_keep_to_the_budget_and_to_a_share_of_it():
+    """Whoever may report could have all of the link for pictures that were there before."""
+    rig = Rig(total_bps=200_000)  # 25 kB in its window
+    now_ns = send_units(rig, 0, until=15, size=1_400)
+    rig.sender.resend(range(4, 15), now_ns=now_ns)
+    again = rig.out.base[15:]
+    assert 1 <= len(again) <= 4
+    assert rig.ledger.worst_window_bps.total <= 200_000
+    assert rig.sender.base(unit(20), now_ns=now_ns)
+    assert rig.ledger.worst_window_bps.total <= 200_000
+    later_ns = now_ns + 2 * SECOND_NS
+    rig.sender.resend((14,), now_ns=later_ns - SECOND_NS)
+    assert len(rig.out.base) > 16, "what had no room may go at the next report"
+
+
 def test_a_base_message_says_what_the_ground_needs():
     """The ground could not order, check or date the pictures."""
     rig = Rig()

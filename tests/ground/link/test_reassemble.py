@@ -8,13 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hvt_common.protocol.messages import MAX_MISSING_BASE, Flags
 from hvt_ground.link.reassemble import (
     ADOPTION_INTERVAL_NS,
     DUPLICATE_AFTER_NS,
     DUPLICATE_SILENCE_NS,
     ORDERLY_UNITS,
-    REORDER_UNITS,
     REORDER_WAIT_NS,
+    RESEND_UNITS,
     RESTART_SILENCE_NS,
     SEQUENCE_SLACK,
     SILENCE_NS,
@@ -36,6 +37,7 @@ class Header:
     sequence: int
     frame_index: int
     keyframe: bool
+    flags: int = 0
 
 
 class Ground:
@@ -47,11 +49,11 @@ class Ground:
         self.out: list[Arrival] = []
         self._sent = 0
 
-    def send(self, sequence, *, key=False, session=1, frame=None, after_ns=FRAME_NS):
+    def send(self, sequence, *, key=False, session=1, frame=None, after_ns=FRAME_NS, flags=0):
         """Let one unit arrive ``after_ns`` later; (verdict, sequence) of all that is settled by it."""
         self.now_ns += after_ns
         self._sent += 1
-        header = Header(session, sequence, sequence * 2 if frame is None else frame, key)
+        header = Header(session, sequence, sequence * 2 if frame is None else frame, key, flags)
         resolved = self.core.accept(header, b"%d/%d" % (session, sequence), now_ns=self.now_ns)
         self.out += resolved
         return [(unit.verdict, unit.header.sequence) for unit in resolved]
@@ -110,6 +112,81 @@ def test_a_whole_stream_is_decoded_whole(running):
     assert [unit.starts_run for unit in running.out] == [True, False, False, False]
     assert running.out[0].starts_session
     assert not running.wants()
+
+
+@pytest.fixture
+def repaired(running):
+    """The same, orderly for long, with an edge that sends again what is missing, 60 ms away."""
+    for sequence in range(4, 4 + ORDERLY_UNITS):
+        running.send(sequence)
+    running.core.round_trip_ns = 60 * MS
+    return running
+
+
+def test_a_hole_waits_for_what_the_edge_sends_again(repaired):
+    """Each lost frame would darken the screen up to the next keyframe, though the frame is on its way."""
+    first = 4 + ORDERLY_UNITS
+    assert repaired.send(first + 1) == []
+    assert (repaired.core.missing, repaired.core.newest_held.header.sequence) == ((first,), first + 1)
+    assert repaired.send(first + 3) == []
+    assert repaired.core.missing == (first, first + 2)
+    assert not repaired.wants()
+    assert repaired.send(first, after_ns=10 * MS, flags=Flags.RESENT) == [
+        ("decode", first),
+        ("decode", first + 1),
+    ]
+    assert repaired.core.missing == (first + 2,)
+    assert repaired.send(first + 2, after_ns=MS, flags=Flags.RESENT)[-1] == ("decode", first + 3)
+    assert (repaired.core.missing, repaired.core.newest_held) == ((), None)
+    counters = repaired.core.counters
+    assert (counters.lost, counters.gaps, counters.resent, counters.replayed) == (0, 0, 2, 0)
+    assert_decodable(repaired.out)
+
+
+def test_what_does_not_come_again_is_waited_for_a_round_trip_and_some(repaired):
+    """A frame that was lost twice would stop the picture for good."""
+    first = 4 + ORDERLY_UNITS
+    repaired.send(first + 1)
+    assert repaired.send(first + 2, after_ns=100 * MS) == []
+    assert not repaired.wants()
+    assert repaired.send(first + 3, after_ns=81 * MS) == [("skip", first + n) for n in (1, 2, 3)]
+    assert repaired.wants()
+    assert (repaired.core.counters.lost, repaired.core.missing) == (1, ())
+
+
+def test_where_nothing_comes_again_no_hole_waits_until_something_does(repaired):
+    """Before an edge that sends nothing again each loss would cost a keyframe, and the wait before it."""
+    at = 4 + ORDERLY_UNITS
+    for _ in range(3):
+        assert repaired.send(at + 1) == []
+        assert repaired.send(at + 2, after_ns=200 * MS)[-1] == ("skip", at + 2)
+        repaired.send(at + 3, key=True)
+        at += 4
+    assert repaired.send(at + 1) == [("skip", at + 1)]
+    repaired.send(at, after_ns=FRAME_NS, flags=Flags.RESENT)  # it comes after all
+    repaired.send(at + 2, key=True)
+    assert repaired.send(at + 4) == [], "and the next hole waits"
+
+
+def test_a_keyframe_ends_the_wait_and_nothing_long_is_waited_for(repaired):
+    """The picture would stand still although it could go on, and a gap of a second never be repaired at all."""
+    at = 4 + ORDERLY_UNITS
+    for _ in range(5):
+        assert repaired.send(at + 1) == []
+        assert repaired.send(at + 2, key=True) == [("skip", at + 1), ("decode", at + 2)]
+        at += 3
+    assert repaired.send(at + 1) == [], "the edge was not at fault"
+    assert repaired.send(at, flags=Flags.RESENT)[-1] == ("decode", at + 1)
+    at += 2
+    assert repaired.send(at + MAX_MISSING_BASE + 1) == [("skip", at + MAX_MISSING_BASE + 1)]
+
+
+def test_so_many_wait_at_the_most_behind_a_hole(repaired):
+    """Whoever can send would fill the memory with pictures that wait."""
+    at = 5 + ORDERLY_UNITS
+    for n in range(RESEND_UNITS):
+        assert repaired.send(at + n, after_ns=0) == []
+    assert len(repaired.send(at + RESEND_UNITS, after_ns=0)) == RESEND_UNITS + 1
 
 
 def test_late_join_asks_at_once_and_shows_from_the_keyframe(ground):
@@ -425,11 +502,15 @@ units = st.tuples(st.booleans(), st.booleans(), st.integers(0, 2), st.sampled_fr
 
 @settings(deadline=None, max_examples=200)
 @given(
-    pattern=st.lists(units, max_size=60), copies_late=st.integers(0, 80), step_ms=st.sampled_from([1, 30, 67])
+    pattern=st.lists(units, max_size=60),
+    copies_late=st.integers(0, 80),
+    step_ms=st.sampled_from([1, 30, 67]),
+    round_trip_ns=st.sampled_from([None, 0, 300 * MS]),
 )
-def test_no_pattern_of_loss_and_reordering_reaches_the_decoder(pattern, copies_late, step_ms):
+def test_no_pattern_of_loss_and_reordering_reaches_the_decoder(pattern, copies_late, step_ms, round_trip_ns):
     """Some unlucky order of packets would break the picture without anyone noticing."""
     ground = Ground()
+    ground.core.round_trip_ns = round_trip_ns
     arrivals = []
     for sequence, (key, lost, copies, late) in enumerate(pattern):
         if not lost:
@@ -437,7 +518,7 @@ def test_no_pattern_of_loss_and_reordering_reaches_the_decoder(pattern, copies_l
             arrivals += [(sequence + late + copies_late * n, sequence, key) for n in range(1, copies + 1)]
     for _, sequence, key in sorted(arrivals, key=lambda arrival: arrival[0]):
         ground.send(sequence, key=key, after_ns=step_ms * MS)
-        assert 0 <= ground.held() <= REORDER_UNITS, "each unit has one verdict, or waits"
+        assert 0 <= ground.held() <= RESEND_UNITS, "each unit has one verdict, or waits"
     assert_decodable(ground.out)
 
     end = len(pattern)
@@ -471,7 +552,7 @@ def test_forged_headers_neither_grow_memory_nor_end_the_picture(messages):
         ground.send(sequence, key=key, session=session, frame=frame, after_ns=after_ms * MS)
         if ground.wants():
             ground.core.keyframe_requested(ground.now_ns)
-        assert 0 <= ground.held() <= REORDER_UNITS, "each unit has one verdict, or waits"
+        assert 0 <= ground.held() <= RESEND_UNITS, "each unit has one verdict, or waits"
         assert footprint_bytes(ground.core) < 40_000
     assert_decodable(ground.out)
 

@@ -75,6 +75,21 @@ def test_the_newest_message_and_its_time_are_reported():
     assert report(reception, 200 * MS).delay_p50_ms == -1.0  # since the last report
 
 
+def test_what_waits_behind_a_hole_has_come_and_what_is_missing_is_named():
+    """The edge would take the link for dead, and hold the very frames that end the wait."""
+    reception = begun()
+    base(reception, 4, arrived_ns=10 * MS)
+    report(reception, 20 * MS)
+    assert reception.note_waiting((5,), header(6), at_ns=80 * MS)
+    assert reception.due(520 * MS)
+    measured = report(reception, 100 * MS)
+    assert (measured.base_sequence, measured.base_held_us, measured.missing_base) == (6, 20_000, (5,))
+    assert not reception.note_waiting((5,), header(7), at_ns=140 * MS), "it has been said"
+    assert reception.note_waiting((5, 8), header(9), at_ns=200 * MS)
+    assert not reception.note_waiting((), None, at_ns=0)
+    assert report(reception, 300 * MS).missing_base == ()
+
+
 def test_before_anything_has_come():
     """A first report would acknowledge what never arrived."""
     measured = report(begun(), 5 * S)

@@ -14,7 +14,7 @@ import pytest
 
 from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.protocol.ledger import Account, overhead_bytes
-from hvt_common.protocol.messages import Info, PoseEncoder
+from hvt_common.protocol.messages import BaseHeader, Flags, Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
 from hvt_ground.perception.models import DetectorThread
@@ -117,6 +117,41 @@ def test_a_unit_that_waited_behind_a_hole_is_reported_as_soon_as_it_is_given_out
     sessions.session.report()
     last = port.reports[-1]
     assert (last.base_sequence, last.base_held_us, last.lost) == (4, 150_000, 1)
+    sessions.close()
+
+
+def test_a_picture_that_the_link_lost_is_asked_for_at_once_and_shown_in_its_turn(flight):
+    """Each lost packet would darken the screen up to the next keyframe."""
+    port, now_ns = Port(), [time.time_ns()]
+    port.flight = flight
+    sessions = EdgeSessions(
+        port,
+        open_session=lambda info, reports: Session(
+            info, pipeline_of=pipeline_of, clock=lambda: now_ns[0], reports=reports, worker_of=patient_worker
+        ),
+        clock=lambda: now_ns[0],
+    )
+
+    def take(item: Received) -> None:
+        now_ns[0] += 66_000_000
+        sessions.handle(replace(item, received_ns=now_ns[0]))
+        sessions.housekeep(pending=False)
+
+    for item in bases(flight, 0, 1, 2, 4):
+        take(item)
+    first = port.reports[-1]
+    assert (first.base_sequence, first.base_held_us, first.missing_base, first.lost) == (4, 0, (3,), 0)
+    said = len(port.reports)
+    take(flight.base(5))
+    assert sessions.session.frames_decoded == 3
+    (lost,) = bases(flight, 3)
+    again = replace(BaseHeader.parse(lost.attachment, lost.payload), flags=Flags.RESENT)
+    take(replace(lost, attachment=again.pack(lost.payload)))
+    assert sessions.session.frames_decoded == 6
+    sessions.session.report()
+    last = port.reports[-1]
+    assert (last.base_sequence, last.missing_base, last.lost, last.base_messages) == (5, (), 1, 6)
+    assert [one.missing_base for one in port.reports[said:-1]] == [(3,)] * (len(port.reports) - said - 1)
     sessions.close()
 
 

@@ -194,6 +194,7 @@ FEEDBACK = replace(
     base_sequence=U32,
     base_held_us=66_000,
     missing_stills=(3, 7),
+    missing_base=(9_001,),
     clock_offset_ns=-I63,
     stills=(RESULT,),
     backlog=(AcknowledgedRange(session_id=U64, kind="base", number=450, acknowledged_bytes=12_000),),

@@ -22,6 +22,7 @@ from hvt_common.protocol.messages.backlog import (
 )
 from hvt_common.protocol.messages.dialogue import (
     BASE_CODEC,
+    MAX_MISSING_BASE,
     MAX_MISSING_STILLS,
     MAX_STILL_CODECS,
     MAX_STILL_RESULTS,

@@ -27,6 +27,8 @@ from hvt_common.protocol.messages.fields import (
 MAX_STILL_RESULTS = 32
 MAX_MISSING_STILLS = 32
 """How many one report names; of more, the newest."""
+MAX_MISSING_BASE = 8
+"""How many one report names; of more, none."""
 MAX_STILL_CODECS = 24
 """How many a ground names."""
 MAX_BASE_CODECS = 8
@@ -151,7 +153,7 @@ class Feedback(Message):
     roi_messages: int = wire_field(_COUNT)
     roi_bytes: int = wire_field(_COUNT)
     lost: int = wire_field(_COUNT)
-    """Messages of base that were not received."""
+    """Messages of base that were not received, or not before they were sent again."""
     corrupt: int = wire_field(_COUNT)
     """Messages of base that came damaged."""
     base_sequence: int = wire_field(Int(-1, U32))
@@ -177,3 +179,6 @@ class Feedback(Message):
     objects_detected: int = wire_field(Int(-1, 65535), default=-1)
     """Objects that the ground's own detector showed when it last looked at a picture, up to ``last_frame_index``.
     What only the edge's tracks or stills show does not count. -1 before it has looked."""
+    missing_base: tuple[int, ...] = wire_field(ListOf(Int(0, U32), MAX_MISSING_BASE), default=())
+    """Sequences of ``base`` behind which newer ones wait; the edge may send each once more. None where they are more:
+    a keyframe is the shorter way then."""

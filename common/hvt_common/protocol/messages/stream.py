@@ -48,6 +48,8 @@ class Flags(IntFlag):
     """Sent as fast as the parts allow: capture times are media time and say nothing about delay."""
     STORED = 8
     """Stored at the edge while the link was down, and sent afterwards."""
+    RESENT = 16
+    """Sent once more, since a ground missed it (`Feedback.missing_base`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
