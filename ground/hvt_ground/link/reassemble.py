@@ -11,8 +11,8 @@ when it is twice as old as any was whose unit came late: at once where none of `
 `REORDER_WAIT_NS`, and `REORDER_UNITS` units, are waited for. A keyframe never waits: what is missing before it no
 longer matters.
 
-*Repair.* An edge that is told what is `missing` sends it again, and a hole waits for that: a round trip and some, or
-as long as it took of late. A link on which nothing comes again has no such wait after three holes.
+*Repair.* An edge that is told what is `missing` sends it again. A hole waits for that, and where it does not come in
+the time that it usually takes, at first a round trip and some, for a keyframe as well: whichever is first.
 
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
@@ -48,9 +48,7 @@ REORDER_WAIT_NS = 100_000_000
 RESEND_UNITS, RESEND_WAIT_NS = 24, 700_000_000
 """So many units, and so long, wait at most behind a hole that the edge was told of."""
 _RESEND_SLACK_NS = 120_000_000
-"""Beyond the round trip: a resent unit waits for its report, and behind what the link already holds."""
-_UNANSWERED = 3
-"""After so many holes in a row for which nothing came again no other waits."""
+"""Beyond the round trip, for the first: a resent unit waits behind what the link already holds."""
 ORDERLY_UNITS = 30
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
@@ -134,8 +132,8 @@ class Reassembler(Generic[T]):
         self._unshown = False  # something came since the last progress that could not be used
         self._hole_ns = 0  # when the newest hole that was given up was first seen
         self._late_ns = 0  # how old a hole ever was when its unit came
-        self._resend_ns = 0  # how old one is of late when the unit comes that was sent again
-        self._unanswered = 0  # holes since then that were given up
+        self._resend_ns: tuple[int, int] | None = None
+        """How old one is when the unit comes that was sent again, and by how much that differs: of late, mean."""
         self._taken = 0
         self._quiet_until_ns = 0  # no request goes before
         self._requested_ns = self._answer_ns = (
@@ -207,7 +205,7 @@ class Reassembler(Generic[T]):
             return False
         if self._adopted_ns is None:
             return self._unshown
-        if not self._synced or (self._held and self._hole_age_ns(now_ns) >= self._patience_ns):
+        if not self._synced or (self._held and self._hole_age_ns(now_ns) >= self._alone_ns):
             return True
         return self._unshown and now_ns - self._progress_ns >= SILENCE_NS
 
@@ -234,14 +232,13 @@ class Reassembler(Generic[T]):
             if (
                 lost
                 and first > keyframe
-                and len(self._held) <= (RESEND_UNITS if self._resend_wait_ns else REORDER_UNITS)
+                and len(self._held) <= (RESEND_UNITS if self._repairs else REORDER_UNITS)
                 and self._hole_age_ns(now_ns) < self._patience_ns
             ):
                 break
             if lost:
-                self._unanswered += first > keyframe and self._resend_wait_ns > 0
                 self._give_up(lost, now_ns)
-            verdict = self._take(unit := self._held.pop(first), now_ns)
+            verdict = self._take(unit := self._held.pop(first))
             released.append(self._judged(unit, verdict, lost_before=lost))
         return released
 
@@ -253,7 +250,7 @@ class Reassembler(Generic[T]):
         self._next += lost
         self._synced = False
 
-    def _take(self, unit: Arrival[T], now_ns: int) -> Verdict:
+    def _take(self, unit: Arrival[T]) -> Verdict:
         header = unit.header
         self._recent = (self._recent << 1 | 1) & _WINDOW_MASK
         self._next = header.sequence + 1
@@ -263,8 +260,9 @@ class Reassembler(Generic[T]):
             self._synced = False
             return "implausible"
         self._last_frame = header.frame_index
-        self._interval_ns = (3 * self._interval_ns + now_ns - self._progress_ns) // 4
-        self._progress_ns = now_ns
+        came_ns = max(self._progress_ns, unit.received_ns)  # it may have waited
+        self._interval_ns = (3 * self._interval_ns + came_ns - self._progress_ns) // 4
+        self._progress_ns = came_ns
         self._unshown = False
         if not self._synced and not header.keyframe:
             return "skip"
@@ -286,14 +284,23 @@ class Reassembler(Generic[T]):
     @property
     def _patience_ns(self) -> int:
         usual_ns = REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
-        return max(usual_ns, self._resend_wait_ns)
+        return RESEND_WAIT_NS if self._repairs else usual_ns
 
     @property
-    def _resend_wait_ns(self) -> int:
-        # How long the present hole waits for what the edge sends again.
-        if self.round_trip_ns is None or self._unanswered >= _UNANSWERED or not self.missing:
-            return 0
-        return min(RESEND_WAIT_NS, max(self.round_trip_ns + _RESEND_SLACK_NS, 5 * self._resend_ns // 4))
+    def _repairs(self) -> bool:
+        # Whether the edge sends again what the present hole lacks.
+        return self.round_trip_ns is not None and bool(self.missing)
+
+    @property
+    def _alone_ns(self) -> int:
+        # How long a hole waits before a keyframe is wanted.
+        if self.round_trip_ns is None or not self._repairs:
+            return self._patience_ns
+        usual_ns = self.round_trip_ns + _RESEND_SLACK_NS
+        if self._resend_ns is not None:
+            mean_ns, differs_ns = self._resend_ns
+            usual_ns = mean_ns + max(2 * differs_ns, mean_ns // 8)
+        return min(RESEND_WAIT_NS, usual_ns)
 
     def _note_late(self, header: BaseHeader, now_ns: int) -> None:
         # The unit of a hole comes after all, before or after that was given up.
@@ -307,7 +314,9 @@ class Reassembler(Generic[T]):
         else:
             return
         if header.flags & Flags.RESENT:
-            self._resend_ns, self._unanswered = max(late_ns, 7 * self._resend_ns // 8), 0
+            mean_ns, differs_ns = self._resend_ns or (late_ns, late_ns // 4)
+            differs_ns = (3 * differs_ns + abs(late_ns - mean_ns)) // 4
+            self._resend_ns = (7 * mean_ns + late_ns) // 8, differs_ns
         else:
             self._late_ns = max(self._late_ns, late_ns)
 
@@ -330,7 +339,9 @@ class Reassembler(Generic[T]):
         if self._adopted_ns is None:
             too_soon, refusal = False, "skip"
         else:
-            silent_ns, adopted_ns = now_ns - self._progress_ns, now_ns - self._adopted_ns
+            newest = self.newest_held
+            came_ns = self._progress_ns if newest is None else newest.received_ns
+            silent_ns, adopted_ns = now_ns - came_ns, now_ns - self._adopted_ns
             too_soon = silent_ns < patience_ns or adopted_ns < ADOPTION_INTERVAL_NS
         if not (too_soon and duplicate):  # while the first edge goes on, nothing of the second is missed
             self._unshown = True
@@ -338,7 +349,7 @@ class Reassembler(Generic[T]):
             return [self._judged(unit, refusal, duplicate=duplicate and too_soon)]
         resolved = self._leave()
         self._adopt(header, now_ns)
-        verdict = self._take(unit, now_ns)
+        verdict = self._take(unit)
         return [*resolved, self._judged(unit, verdict, starts_session=True)]
 
     def _leave(self) -> list[Arrival[T]]:
