@@ -194,8 +194,8 @@ def test_who_waits_for_a_lost_picture_is_not_silent(repaired):
     for n in range(9):
         repaired.send(at + n)
     assert repaired.send(0, key=True, session=2, after_ns=10 * MS) == [("foreign", 0)]
-    repaired.send(at + 9)
-    repaired.send(at + 10)
+    for n in range(9, 12):
+        repaired.send(at + n)
     assert repaired.core.newest_held is None
     assert repaired.send(0, key=True, session=2, after_ns=510 * MS) == [("decode", 0)]
 
