@@ -70,11 +70,13 @@ class Ground:
                 self.shown_ns.append(now_ns)
                 self.seen.add(unit.header.sequence)
 
-    def missing(self) -> tuple[int, ...]:
-        """What it has not asked for yet."""
-        new = tuple(one for one in self.reassembler.missing if one not in self.asked)
-        self.asked.update(new)
-        return new
+    def missing(self, now_ns: int) -> tuple[int, ...]:
+        """What a report names: one goes at once for what is new."""
+        missing = self.reassembler.missing
+        if now_ns % REPORT_NS and self.asked.issuperset(missing):
+            return ()
+        self.asked.update(missing)
+        return missing
 
 
 @dataclass
@@ -121,7 +123,7 @@ class Minute:
         if wants:
             yield self._request
         if self.resends and ground.number == 0:
-            yield partial(self._resend, ground.missing())
+            yield partial(self._resend, ground.missing(now_ns))
 
     def _request(self, now_ns: int) -> None:
         self.refused += self.requests.request(now_ns) is not None
@@ -139,8 +141,9 @@ class Minute:
 
     def _resend(self, missing: tuple[int, ...], now_ns: int) -> None:
         for sequence in missing:
-            if unit := self.in_flight.missing(sequence, now_ns=now_ns):
+            if unit := self.in_flight.missing(sequence, now_ns=now_ns, round_trip_ns=2 * self.way_ms * MS):
                 self.resent += 1
+                self.in_flight.resent(sequence, now_ns=now_ns)
                 self.sees[0].send(Header(1, sequence, sequence, unit.keyframe, Flags.RESENT), now_ns)
 
     @property

@@ -47,6 +47,8 @@ _MEMORY_NS = 15 * SECOND_NS
 _MOST_RECORDS = 1024
 _RESEND_NS = SECOND_NS
 """An access unit that is older is not sent again: a keyframe has been requested by then."""
+_AGAIN_NS = 30 * _MS
+"""Beyond one and a half round trips, until what was sent again counts as lost again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +180,8 @@ class BaseInFlight:
         self._lock = threading.Lock()
         self._units: dict[int, tuple[int, AccessUnit]] = {}
         """Sequence → time of sending and unit, in order."""
+        self._resent: dict[int, int] = {}
+        """Sequence → when it went out again last."""
         self.size_bytes = 0
 
     def __len__(self) -> int:
@@ -201,31 +205,37 @@ class BaseInFlight:
                 self._forget(one)
             return bool(come)
 
-    def missing(self, sequence: int, *, now_ns: int) -> AccessUnit | None:
-        """A unit that is worth sending once more; None where it is too old, or a keyframe was sent since."""
+    def missing(self, sequence: int, *, now_ns: int, round_trip_ns: int) -> AccessUnit | None:
+        """A unit that is worth sending once more; None where it is too old, or a keyframe was sent since.
+
+        So is one that went once more less than a ``round_trip_ns`` ago: it may be there by now.
+        """
         with self._lock:
             sent_ns, unit = self._units.get(sequence, (0, None))
+            resent_ns = self._resent.get(sequence, sent_ns - _AGAIN_NS - 2 * round_trip_ns)
             newer = (one for at, (_, one) in self._units.items() if at > sequence)
             if unit is None or now_ns - sent_ns > _RESEND_NS or any(one.keyframe for one in newer):
                 return None
-            return unit
+            return unit if now_ns - resent_ns > _AGAIN_NS + 3 * round_trip_ns // 2 else None
 
-    def resent(self, sequence: int) -> None:
-        """It goes out again, and not a third time."""
+    def resent(self, sequence: int, *, now_ns: int) -> None:
+        """It goes out again."""
         with self._lock:
             if sequence in self._units:
-                self._forget(sequence)
+                self._resent[sequence] = now_ns
 
     def take(self) -> list[AccessUnit]:
         """Return and forget all that may be lost, in order."""
         with self._lock:
             units = [unit for _, unit in self._units.values()]
             self._units.clear()
+            self._resent.clear()
             self.size_bytes = 0
         return units
 
     def _forget(self, sequence: int) -> None:
         self.size_bytes -= len(self._units.pop(sequence)[1].data)
+        self._resent.pop(sequence, None)
 
 
 class Pacer:

@@ -159,7 +159,7 @@ class Transmitter:
         """
         for sequence in () if self.lockstep else missing:
             with self._lock:
-                unit = self.in_flight.missing(sequence, now_ns=now_ns)
+                unit = self.in_flight.missing(sequence, now_ns=now_ns, round_trip_ns=self.round_trip_ns)
                 if unit is None:
                     continue
                 line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
@@ -174,7 +174,7 @@ class Transmitter:
                 self.budget.record_resent(line_bytes, now_ns=at_ns)
                 if self.pacer is not None:
                     self.pacer.sent_other(line_bytes, now_ns=at_ns)
-                self.in_flight.resent(sequence)
+                self.in_flight.resent(sequence, now_ns=at_ns)
             self.wait_until(at_ns)
             self.outlet.put(
                 Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
