@@ -153,7 +153,7 @@ class Reception:
                 )
             self._arrive(item)
 
-    def note_waiting(self, missing: tuple[int, ...], newest: BaseHeader | None, *, at_ns: int) -> bool:
+    def note_held(self, missing: tuple[int, ...], newest: BaseHeader | None, *, at_ns: int) -> bool:
         """Access units wait behind what is ``missing``, ``newest`` since ``at_ns``; whether anything is news there.
 
         They count as received: until its frames do, the edge holds the next ones.

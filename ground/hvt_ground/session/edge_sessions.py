@@ -165,13 +165,13 @@ class EdgeSessions:
         for packet in self.receiver.receive(item):
             self._route(packet)
         if self.session is not None:
-            self._note_waiting(self.session)
+            self._note_held(self.session)
 
-    def _note_waiting(self, session: Session) -> None:
+    def _note_held(self, session: Session) -> None:
         # What is missing is said at once: each moment more is one without a picture.
         missing, newest = self.receiver.stream.missing, self.receiver.stream.newest_held
         header, at_ns = (None, 0) if newest is None else (newest.header, newest.message.received_ns)
-        if session.reception.note_waiting(missing, header, at_ns=at_ns):
+        if session.reception.note_held(missing, header, at_ns=at_ns):
             session.report()
 
     def close(self) -> None:

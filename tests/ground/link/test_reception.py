@@ -80,13 +80,13 @@ def test_what_waits_behind_a_hole_has_come_and_what_is_missing_is_named():
     reception = begun()
     base(reception, 4, arrived_ns=10 * MS)
     report(reception, 20 * MS)
-    assert reception.note_waiting((5,), header(6), at_ns=80 * MS)
+    assert reception.note_held((5,), header(6), at_ns=80 * MS)
     assert reception.due(520 * MS)
     measured = report(reception, 100 * MS)
     assert (measured.base_sequence, measured.base_held_us, measured.missing_base) == (6, 20_000, (5,))
-    assert not reception.note_waiting((5,), header(7), at_ns=140 * MS), "it has been said"
-    assert reception.note_waiting((5, 8), header(9), at_ns=200 * MS)
-    assert not reception.note_waiting((), None, at_ns=0)
+    assert not reception.note_held((5,), header(7), at_ns=140 * MS), "it has been said"
+    assert reception.note_held((5, 8), header(9), at_ns=200 * MS)
+    assert not reception.note_held((), None, at_ns=0)
     assert report(reception, 300 * MS).missing_base == ()
 
 
