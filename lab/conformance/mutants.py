@@ -350,7 +350,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a pose may go back in time", "time > this.time && ", ""),
     Mutant("a pose's number does not begin again at 16", "(this.number + 1) % 16", "this.number + 1"),
     # Where a still is
-    Mutant("a word may be one beyond the list", "BigInt(words.length - 1)", "BigInt(words.length)"),
+    Mutant("a word may be one beyond the list", "BigInt(high)", "BigInt(high + 1)"),
     Mutant("a word may be a text of any length", "text(most)(value);", "text(1e9)(value);"),
     Mutant(
         "a place may have nine numbers",

@@ -167,7 +167,8 @@ const allowed = (value: string): boolean =>
 function kindOf(row: any): Kind {
   switch (row.type) {
     case "int": return int(BigInt(row.low), BigInt(row.high));
-    case "word": return word(row.words, row.most_bytes);
+    case "word": return listed(row.words.length - 1, row.most_bytes);
+    case "listed": return listed(row.high, row.most_bytes);
     case "float": return float(row.low, row.high);
     case "bool": return bool;
     case "str": return text(row.most_bytes);
@@ -183,10 +184,10 @@ function kindOf(row: any): Kind {
 const valueOf = (json: any): Value => typeof json === "number" ? BigInt(json) : Array.isArray(json) ? json.map(valueOf) : json;
 const fieldsOf = (table: any): Fields =>
   table.fields.map((row: any) => ({ name: row.name, kind: kindOf(row), missing: "default" in row ? valueOf(row.default) : undefined }));
-// A word of the list by its number, or any other text.
-const word = (words: string[], most: number): Kind => (value) => {
+// A word of a list by its number, or any other text.
+const listed = (high: number, most: number): Kind => (value) => {
   if (typeof value === "string") text(most)(value);
-  else int(0n, BigInt(words.length - 1))(value);
+  else int(0n, BigInt(high))(value);
 };
 const nested = (fields: Fields): Kind => (value) => {
   need(Array.isArray(value), "no nested array");

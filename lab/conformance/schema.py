@@ -121,6 +121,8 @@ def described(kind: dict[str, Any]) -> str:  # noqa: C901, PLR0911 - one return 
             return (
                 ", ".join(f"{number} {word}" for number, word in enumerate(words)) + f"; else str ≤ {most} B"
             )
+        case {"type": "listed", "high": high, "most_bytes": most}:
+            return f"int 0…{high} or str ≤ {most} B"
         case {"type": "scalar", "most_bytes": most}:
             return f"int, finite float or str ≤ {most} B"
         case {"type": "array", "least": least, "most": most, "of": of}:

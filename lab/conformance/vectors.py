@@ -111,7 +111,7 @@ _OF_ANY_TYPE: tuple[tuple[Any, str], ...] = (
 )
 
 
-def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901, PLR0912 - a case for each type
+def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901, PLR0912, PLR0915 - a case for each type
     """Values at and beyond the bounds of a schema; MessagePack holds no more than 64 bits."""
     match kind:
         case {"type": "int", "low": low, "high": high}:
@@ -124,6 +124,9 @@ def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901, 
             yield from ((one, f"is {what}") for one, what in found if -(2**63) <= one < 2**64)
         case {"type": "word", "words": words, "most_bytes": most}:
             yield from edges({"type": "int", "low": 0, "high": len(words) - 1})
+            yield from edges({"type": "str", "most_bytes": most})
+        case {"type": "listed", "high": high, "most_bytes": most}:
+            yield from edges({"type": "int", "low": 0, "high": high})
             yield from edges({"type": "str", "most_bytes": most})
         case {"type": "float", "low": low, "high": high}:
             yield from ((low, "is at its bound"), (high, "is at its upper bound"), (math.nan, "is NaN"))

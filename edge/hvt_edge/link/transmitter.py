@@ -95,6 +95,8 @@ class Transmitter:
     pacer: Pacer | None = None
     in_flight: BaseInFlight = field(default_factory=BaseInFlight)
     clock: Callable[[], int] | None = None
+    class_names: tuple[str, ...] = ()
+    """Those of `Info`: a still that a ground is known to have it for names its class by the index."""
 
     def __post_init__(self) -> None:
         self._keys = EdgeKeys(self.edge_id)
@@ -410,13 +412,15 @@ class Transmitter:
                 reason=fitted_text(header.reason, 48),
             )
             self._packed = packed = header, PackedMessage.of(sent)
-        times = {"send_delay_ns": send_ns - header.capture_ns}
-        # A ground that has the frame knows when it was captured; but who asks need not have the video.
-        known = not stored and self._captures.knows(self.session_id, header.frame_index)
-        if known and "ask" not in header.parameters:
-            times["capture_ns"] = -1
+        fields = {"send_delay_ns": send_ns - header.capture_ns}
+        # Who asks need not have the video, nor the session's facts; nor will they be at hand where a still is stored.
+        if not stored and "ask" not in header.parameters:
+            if self._captures.knows(self.session_id, header.frame_index):
+                fields["capture_ns"] = -1
+            if header.class_name in self.class_names:
+                fields["class_name"] = self.class_names.index(header.class_name)
         flags = self._flags | Flags.STORED if stored else self._flags
-        return packed[1].with_fields(flags=int(flags), **times)
+        return packed[1].with_fields(flags=int(flags), **fields)
 
     def _payload(self, line_bytes: int, still: Still, now_ns: int) -> int:
         header_bytes = self._header_at(still, now_ns).size_bytes

@@ -132,6 +132,7 @@ class Link:
             wait_until=flight.loop_clock.wait_until,
             pacer=self.pacer,
             clock=None if lockstep else flight.loop_clock,
+            class_names=fitted_class_names(flight.detector.class_names),
         )
         self.split = make_split(config, size, first_share=beginning.share)
         self.reconfiguration = make_reconfiguration(
@@ -181,7 +182,7 @@ class Stills:
             session_id=flight.session_id,
             operating=link.operating,
             view=view,
-            class_names=fitted_class_names(class_names),
+            class_names=link.transmitter.class_names,
             channels=channels_of(config, live=flight.source.live),
             still_codecs=lambda: maker.codec_names,
             clock=clock,

@@ -152,6 +152,7 @@ class Session:
         """Take another message than an access unit. Raises `WireError` where what is in it makes no sense."""
         match header:
             case RoiHeader():
+                header = header.named(self.info.class_names)
                 if self.reception.still(header, item):
                     self.worker.still(ReceivedStill(header, item.payload))
             case TrackStep():

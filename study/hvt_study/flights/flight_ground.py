@@ -190,6 +190,7 @@ class GroundSide:
         elif row is Channel.ROI:
             header = RoiHeader.parse(item.attachment, item.payload)
             header = self._captures.filled(header, otherwise_ns=arrival.arrival_ns - header.send_delay_ns)
+            header = header.named(self._info.class_names)
             self._record.still(header, arrival)
             self._session.take(header, item)
         elif row is Channel.TRACKS:

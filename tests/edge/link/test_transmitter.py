@@ -20,6 +20,7 @@ from hvt_common.protocol.messages import (
     Flags,
     RoiHeader,
     Status,
+    WireError,
 )
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BudgetSettings, RollingBudget
@@ -540,6 +541,21 @@ def test_the_time_of_a_frame_that_was_sent_is_not_sent_again():
     assert captures.filled(replace(headers[0], session_id=9), otherwise_ns=2**64).capture_ns == 2**63 - 1
     captures.note(replace(BaseHeader.parse(*base), frame_index=5, capture_ns=NOW_NS + 203))
     assert captures.filled(lost, otherwise_ns=7).capture_ns == NOW_NS + 603, "by the rate of the two nearest"
+
+
+def test_a_class_that_the_session_lists_is_sent_as_its_place_there():
+    """Each still of a pedestrian would say so in eleven bytes; one on request, or stored, is read without a list."""
+    rig, names = Rig(), ("van", "car")
+    rig.sender.class_names = names
+    for one in (still(), still(class_name="tram"), still(parameters={"ask": 1})):
+        rig.sender.still(one, now_ns=NOW_NS)
+    stored = rig.sender.store_still(still(), now_ns=NOW_NS)
+    headers = [RoiHeader.parse(attachment, data) for _, data, attachment, _ in rig.out.puts]
+    assert [one.class_name for one in headers] == [1, "tram", "car"]
+    assert [one.named(names).class_name for one in headers] == ["car", "tram", "car"]
+    assert RoiHeader.parse(stored.attachment, stored.payload).class_name == "car"
+    with pytest.raises(WireError, match="a still of class 1, where 1 are named"):
+        headers[0].named(("van",))
 
 
 @settings(max_examples=60, deadline=None)

@@ -17,6 +17,7 @@ from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import BaseHeader, Flags, Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
+from hvt_ground.events import Event, Refinement
 from hvt_ground.perception.models import DetectorThread
 from hvt_ground.perception.worker import LockstepWorker
 from hvt_ground.report.status import completed, summary, table
@@ -32,7 +33,15 @@ class Rig:
     """A receiver with a port; sessions without a recording."""
 
     def __init__(
-        self, *, detector=None, thread=None, reader=None, clock=None, worker_of=patient_worker, **patience
+        self,
+        *,
+        detector=None,
+        thread=None,
+        reader=None,
+        clock=None,
+        worker_of=patient_worker,
+        sinks=(),
+        **patience,
     ) -> None:
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
@@ -40,7 +49,7 @@ class Rig:
         self.detector, self.detector_thread = detector, thread
         self.opened: list[Session] = []
         self.ended: list[Session] = []
-        self.worker_of = worker_of
+        self.worker_of, self.sinks = worker_of, sinks
         self.receiver = EdgeSessions(
             self.port, open_session=self._open, on_ended=self.ended.append, clock=clock, **patience
         )
@@ -53,6 +62,7 @@ class Rig:
                 emit, detector=self.detector, detector_thread=self.detector_thread, reader=self.reader
             ),
             clock=time.time_ns,
+            sinks=self.sinks,
             reports=reports,
             worker_of=None if info.pace == "lockstep" else self.worker_of,
         )
@@ -520,6 +530,27 @@ def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
         assert (session.reception.stills, session.reception.frames) == (1, 6)
         assert session.reception.ledger.messages(Account.ROI) == 1
         assert rig.receiver.receiver.unusable == 1, "the other one's"
+
+
+def test_the_class_of_a_still_may_be_a_place_in_the_list_of_its_session(flight):
+    """Its name would be a number on the screen; and one beyond the list end the session."""
+    events: list[Event] = []
+
+    class Shown:
+        closed, log = False, staticmethod(events.append)
+
+        def close(self) -> None:
+            """Nothing to close."""
+
+    with Rig(sinks=[Shown()]) as rig:
+        rig.port.flight = flight
+        rig.put(
+            *bases(flight, *range(6)), flight.still(1, 0, class_name=1), flight.still(2, 1, class_name=99)
+        )
+        rig.settle()
+        assert (rig.receiver.session.reception.stills, rig.receiver.receiver.unusable) == (1, 1)
+    (seen,) = (one for one in events if isinstance(one, Refinement))
+    assert seen.header.class_name == flight.info().class_names[1]
 
 
 def test_poses_that_come_before_their_session_is_open_are_taken(flight):

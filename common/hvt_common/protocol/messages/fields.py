@@ -238,6 +238,20 @@ class Word(Kind):
 
 
 @dataclass(frozen=True, slots=True)
+class Listed(Kind):
+    """The index of a text in a list that another message has brought, at most ``high``, or any text."""
+
+    high: int
+    max_bytes: int
+
+    def decode(self, raw: Any) -> Any:
+        return Text(self.max_bytes).decode(raw) if type(raw) is str else Int(0, self.high).decode(raw)
+
+    def schema(self) -> dict[str, Any]:
+        return {"type": "listed", "high": self.high, "most_bytes": self.max_bytes}
+
+
+@dataclass(frozen=True, slots=True)
 class Scalar(Kind):
     """A parameter's value: a whole number of 64 bits, a finite float or short text."""
 

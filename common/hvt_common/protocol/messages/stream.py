@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import Any, ClassVar, Self
@@ -14,6 +14,7 @@ from hvt_common.protocol.messages.fields import (
     U64,
     Box,
     Int,
+    Listed,
     ListOf,
     MapOf,
     Scalar,
@@ -23,6 +24,7 @@ from hvt_common.protocol.messages.fields import (
     Word,
     wire_field,
 )
+from hvt_common.protocol.messages.track_boxes import MOST_CLASSES
 from hvt_common.runtime.statistics import Newest
 
 MAX_ALSO = 15
@@ -117,7 +119,8 @@ class StillWire(Message):
     place: tuple[int, ...] = wire_field(ListOf(_PLACE, 10))
     """Of the crop x, y, width and height; how far inside its sides those of the track's box are, left, top, right,
     bottom, in eighths; and, where it is not the crop's own, the coded size."""
-    class_name: str = wire_field(Text(64))
+    class_name: int | str = wire_field(Listed(MOST_CLASSES - 1, 64))
+    """The first is its index in `Info.class_names`."""
     confidence: float = wire_field(Scaled(0, 1, 1000))
     reason: str = wire_field(Word(STILL_REASON_WORDS, 48))
     codec: str = wire_field(Word(STILL_CODEC_WORDS, 24))
@@ -204,6 +207,7 @@ class RoiHeader(Message):
     crop_source_px: tuple[int, int, int, int] = wire_field(_CROP)
     """What the still shows."""
     class_name: str = wire_field(Text(64))
+    """By the edge's detector. As it comes it may be an index: see `named`."""
     confidence: float = wire_field(Scaled(0, 1, 1000))
     reason: str = wire_field(Text(48))
     """Why the method sent it."""
@@ -224,6 +228,15 @@ class RoiHeader(Message):
         if version < _COMPACT:
             return from_values(cls, values, version)
         return from_values(StillWire, values, version).header()  # type: ignore[return-value]
+
+    def named(self, class_names: Sequence[str]) -> RoiHeader:
+        """With the name of its class, from `Info.class_names`; `WireError` where that has no such index."""
+        index: Any = self.class_name
+        if isinstance(index, str):
+            return self
+        if index >= len(class_names):
+            raise WireError(f"a still of class {index}, where {len(class_names)} are named")
+        return replace(self, class_name=class_names[index])
 
     @property
     def send_ns(self) -> int:
