@@ -372,7 +372,7 @@ class Pacer:
                     arrived_bytes=sent.up_to_bytes,
                     delivery_bps=8e9 * sent.line_bytes / max(1, now_ns - sent.sent_ns - held_ns),
                     messages=sent.messages,
-                    lost=feedback.lost,
+                    lost=feedback.lost_so_far,
                 )
             )
             if self.backoffs > backoffs:
@@ -457,8 +457,9 @@ class Pacer:
 
     def _note_losses(self, feedback: Feedback, now_ns: int) -> None:
         # What was overdue and came after all was late: in a queue, which further probes would only make longer.
-        if feedback.lost != self._lost:
-            self._lossy, self._lost = feedback.lost > self._lost, feedback.lost
+        lost = feedback.lost_so_far
+        if lost != self._lost:
+            self._lossy, self._lost = lost > self._lost, lost
             self._doubted = None
         elif self._doubted is None or feedback.base_sequence < self._doubted:
             self._open_ns = now_ns

@@ -157,17 +157,18 @@ class Transmitter:
         """Send access units that the primary receiver misses once more, before those that are yet to come.
 
         What has no room in the budget's window within `_RESEND_WAIT_NS`, or is beyond the share of such messages, may
-        go at the next report.
+        go at the next report, and so may those behind it, which are of no use without.
         """
         for sequence in () if self.lockstep else missing:
+            now_ns = now_ns if self.clock is None else max(now_ns, self.clock())
             with self._lock:
                 unit = self.in_flight.missing(sequence, now_ns=now_ns, round_trip_ns=self.round_trip_ns)
                 if unit is None:
                     continue
                 line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
                 at_ns = self.budget.resend_ns(line_bytes, now_ns=now_ns)
-                if at_ns is None or at_ns - now_ns > _RESEND_WAIT_NS:
-                    continue
+                if self._ended or at_ns is None or at_ns - now_ns > _RESEND_WAIT_NS:
+                    return
                 header = self._base_header(sequence, unit, at_ns=at_ns, resent=True)
                 attachment = header.pack(unit.data)
                 line_bytes = self._count(

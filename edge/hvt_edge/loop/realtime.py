@@ -288,8 +288,7 @@ class LinkControl:
         # Whether the report counts is decided here, once.
         sent = (self.transmitter.base_sequence, self.transmitter.still_sequence)
         report = self._primary.judge(feedback, sent=sent, now_ns=now_ns)
-        lost = feedback.lost + feedback.corrupt + len(feedback.missing_base)
-        self.keyframes.report_losses(feedback.receiver_id, lost)
+        self.keyframes.report_losses(feedback.receiver_id, feedback.lost_so_far + feedback.corrupt)
         if self.pacer is not None:
             self.pacer.on_report(report)
             self.keyframes.note_round_trip(self.pacer.round_trip_ns)

@@ -12,7 +12,8 @@ when it is twice as old as any was whose unit came late: at once where none of `
 longer matters.
 
 *Repair.* An edge that is told what is `missing` sends it again. A hole waits for that, and where it does not come in
-the time that it usually takes, at first a round trip and some, for a keyframe as well: whichever is first.
+the time that it usually takes, at first a round trip and some, for a keyframe as well: whichever is first. No hole
+waits that the edge has no room to fill, nor on a link where nothing came again of late: the keyframe would be later.
 
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
@@ -49,6 +50,10 @@ RESEND_UNITS, RESEND_WAIT_NS = 24, 700_000_000
 """So many units, and so long, wait at most behind a hole that the edge was told of."""
 _RESEND_SLACK_NS = 120_000_000
 """Beyond the round trip, for the first: a resent unit waits behind what the link already holds."""
+_MOST_INTERVAL_NS, _MOST_HOLE_NS = 160_000_000, 210_000_000
+"""From one unit to the next, and of all of a hole: more would be more of a second's bytes than are sent again."""
+_UNANSWERED, _UNANSWERED_NS, _MOST_UNANSWERED_NS = 3, 20_000_000_000, 640_000_000_000
+"""After so many holes in a row for which nothing came again none waits for so long; then one, and twice as long."""
 ORDERLY_UNITS = 30
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
@@ -129,9 +134,12 @@ class Reassembler(Generic[T]):
         self._synced = False
         self._progress_ns = 0
         self._interval_ns = 0  # about the time between two units of the present session
+        self._newest = (0, 0)  # its highest sequence, and when that came
         self._unshown = False  # something came since the last progress that could not be used
         self._hole_ns = 0  # when the newest hole that was given up was first seen
         self._late_ns = 0  # how old a hole ever was when its unit came
+        self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
+        """Such holes; the time until which none waits; for how long none will."""
         self._resend_ns: tuple[int, int] | None = None
         """How old one is when the unit comes that was sent again, and by how much that differs: of late, mean."""
         self._taken = 0
@@ -162,14 +170,29 @@ class Reassembler(Generic[T]):
             return self._accept_outsider(unit, "stale", patience_ns=RESTART_SILENCE_NS)
         if not self._plausible(header, now_ns):
             return self._accept_outsider(unit, "implausible", patience_ns=RESTART_SILENCE_NS)
+        if (units := header.sequence - self._newest[0]) > 0:
+            self._interval_ns = (3 * self._interval_ns + (now_ns - self._newest[1]) // units) // 4
+            self._newest = header.sequence, now_ns
         self._held[header.sequence] = unit
         return self.overdue(now_ns=now_ns)
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """The sequences behind which newer units wait; none where they are too many to be sent again."""
+        """The sequences behind which newer units wait, where it may help that the edge sends them again."""
         newest = max(self._held, default=self._next - 1)
-        if newest + 1 - self._next - len(self._held) > MAX_MISSING_BASE:
+        count = newest + 1 - self._next - len(self._held)
+        if self.round_trip_ns is None or not 0 < count <= MAX_MISSING_BASE:
+            return ()
+        if self.round_trip_ns + _RESEND_SLACK_NS > RESEND_WAIT_NS:
+            return ()
+        if self._interval_ns > _MOST_INTERVAL_NS or count * self._interval_ns > _MOST_HOLE_NS:
+            return ()
+        # With no keyframe before it, what is missing is of use only where it may be the keyframe that was requested.
+        first_ns = min(unit.received_ns for unit in self._held.values())
+        useful = self._synced or (
+            self._requests_in_gap and first_ns - self._requested_ns >= self.round_trip_ns
+        )
+        if not useful or first_ns < self._until_ns:
             return ()
         return tuple(one for one in range(self._next, newest) if one not in self._held)
 
@@ -237,10 +260,19 @@ class Reassembler(Generic[T]):
             ):
                 break
             if lost:
+                self._note_unanswered(now_ns)
                 self._give_up(lost, now_ns)
             verdict = self._take(unit := self._held.pop(first))
             released.append(self._judged(unit, verdict, lost_before=lost))
         return released
+
+    def _note_unanswered(self, now_ns: int) -> None:
+        # Of a hole that ends unfilled, after it has waited longer than it usually takes.
+        if self._repairs and self._hole_age_ns(now_ns) >= self._alone_ns:
+            self._unanswered += 1
+            if self._unanswered >= _UNANSWERED:
+                self._until_ns = now_ns + self._pause_ns
+                self._pause_ns = min(2 * self._pause_ns, _MOST_UNANSWERED_NS)
 
     def _give_up(self, lost: int, now_ns: int) -> None:
         self._hole_ns = now_ns - self._hole_age_ns(now_ns)
@@ -260,9 +292,7 @@ class Reassembler(Generic[T]):
             self._synced = False
             return "implausible"
         self._last_frame = header.frame_index
-        came_ns = max(self._progress_ns, unit.received_ns)  # it may have waited
-        self._interval_ns = (3 * self._interval_ns + came_ns - self._progress_ns) // 4
-        self._progress_ns = came_ns
+        self._progress_ns = max(self._progress_ns, unit.received_ns)  # it may have waited
         self._unshown = False
         if not self._synced and not header.keyframe:
             return "skip"
@@ -288,8 +318,8 @@ class Reassembler(Generic[T]):
 
     @property
     def _repairs(self) -> bool:
-        # Whether the edge sends again what the present hole lacks.
-        return self.round_trip_ns is not None and bool(self.missing)
+        # Whether the edge is to send again what the present hole lacks.
+        return bool(self.missing)
 
     @property
     def _alone_ns(self) -> int:
@@ -317,6 +347,7 @@ class Reassembler(Generic[T]):
             mean_ns, differs_ns = self._resend_ns or (late_ns, late_ns // 4)
             differs_ns = (3 * differs_ns + abs(late_ns - mean_ns)) // 4
             self._resend_ns = (7 * mean_ns + late_ns) // 8, differs_ns
+            self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
         else:
             self._late_ns = max(self._late_ns, late_ns)
 
@@ -366,7 +397,7 @@ class Reassembler(Generic[T]):
         self._left.pop(header.session_id, None)
         self._session, self._adopted_ns = header.session_id, now_ns
         self._outsiders.clear()
-        self._interval_ns, self._progress_ns = 0, now_ns
+        self._interval_ns, self._progress_ns, self._newest = 0, now_ns, (header.sequence, now_ns)
         self._first = self._next = header.sequence
         self._last_frame, self._recent = header.frame_index - 1, 0
 

@@ -46,6 +46,8 @@ REPORT_LINE_BYTES = 180
 """Line bytes of a report without results."""
 _SHARE = 0.03
 _LEAST_NS, _MOST_NS = 100 * _MS, 500 * _MS
+_LEAST_NEWS_NS = 20 * _MS
+"""Between two reports, where something is missing."""
 _RATE_OVER_NS = 2 * SECOND_NS
 _MOST_DELAYS, _MOST_DELAY_MS = 256, 3_600_000.0
 _ACCOUNTS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.BACKLOG: Account.BACKLOG}
@@ -154,7 +156,7 @@ class Reception:
             self._arrive(item)
 
     def note_held(self, missing: tuple[int, ...], newest: BaseHeader | None, *, at_ns: int) -> bool:
-        """Access units wait behind what is ``missing``, ``newest`` since ``at_ns``; whether anything is news there.
+        """Access units wait behind what is ``missing``, ``newest`` since ``at_ns``; whether to report that at once.
 
         They count as received: until its frames do, the edge holds the next ones.
         """
@@ -163,7 +165,7 @@ class Reception:
             self._missing_base = missing
             if newest is not None and newest.sequence > self._base_sequence:
                 self._base_sequence, self._arrived_ns, self._news = newest.sequence, at_ns, True
-            return news
+            return news and (self._reported_ns is None or at_ns - self._reported_ns > _LEAST_NEWS_NS)
 
     def still(self, header: RoiHeader, item: Received) -> bool:
         """Whether a still is to be shown; a second one of the same number is but counted, a third ignored."""

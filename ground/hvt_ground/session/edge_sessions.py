@@ -164,13 +164,18 @@ class EdgeSessions:
         """Take one message; raises whatever goes wrong with it."""
         for packet in self.receiver.receive(item):
             self._route(packet)
-        if self.session is not None:
-            self._note_held(self.session)
+        self._note_held()
 
-    def _note_held(self, session: Session) -> None:
+    def _note_held(self) -> None:
         # What is missing is said at once: each moment more is one without a picture.
-        missing, newest = self.receiver.stream.missing, self.receiver.stream.newest_held
-        header, at_ns = (None, 0) if newest is None else (newest.header, newest.message.received_ns)
+        session, newest = self.session, self.receiver.stream.newest_held
+        if session is None:
+            return
+        missing: tuple[int, ...] = ()
+        header, at_ns = None, 0
+        if newest is not None and newest.header.session_id == session.info.session_id:
+            missing = self.receiver.stream.missing
+            header, at_ns = newest.header, newest.message.received_ns
         if session.reception.note_held(missing, header, at_ns=at_ns):
             session.report()
 
@@ -188,6 +193,7 @@ class EdgeSessions:
         """Do what is due by now; raises whatever goes wrong with it."""
         for packet in self.receiver.take_overdue(pending=pending):
             self._route(packet)
+        self._note_held()
         session, now_ns = self.session, time.monotonic_ns()
         if self._pause.due(now_ns) and self.receiver.take_keyframe_request(pending=pending):
             if session is not None:
@@ -210,7 +216,7 @@ class EdgeSessions:
             session.report_backlog()
         session.report_if_due()
         self._refresh_clock(session, now_ns)
-        clock = None if session.lockstep else self._clock_offset.estimate
+        clock = self._clock_offset.estimate
         self.receiver.stream.round_trip_ns = (
             None if clock is None else 2 * clock[1]
         )  # its error is half of one

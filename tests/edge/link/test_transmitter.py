@@ -175,6 +175,9 @@ def test_repetitions_keep_to_the_budget_and_to_a_share_of_it():
     assert rig.ledger.worst_window_bps.total <= 200_000
     assert rig.sender.base(unit(20), now_ns=now_ns)
     assert rig.ledger.worst_window_bps.total <= 200_000
+    assert [one.sequence for one in again] == list(range(4, 4 + len(again))), (
+        "no frame without those before it"
+    )
     later_ns = now_ns + 2 * SECOND_NS
     rig.sender.resend((14,), now_ns=later_ns - SECOND_NS)
     assert len(rig.out.base) > 16, "what had no room may go at the next report"

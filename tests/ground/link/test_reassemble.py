@@ -153,9 +153,8 @@ def test_where_nothing_comes_again_a_keyframe_is_asked_for_and_whichever_is_firs
     assert repaired.wants()
     assert repaired.send(at, after_ns=30 * MS, flags=Flags.RESENT)[-1] == ("decode", at + 3)
     assert not repaired.wants()
-    repaired.send(at + 5)
-    assert repaired.send(at + 6, after_ns=699 * MS) == []
-    assert repaired.send(at + 7, after_ns=MS) == [("skip", at + n) for n in (5, 6, 7)]
+    assert [repaired.send(at + 5 + n) for n in range(11)] == [[]] * 11
+    assert repaired.send(at + 16) == [("skip", at + n) for n in range(5, 17)]
     assert (repaired.core.counters.lost, repaired.core.missing) == (1, ())
 
 
@@ -166,6 +165,8 @@ def test_the_wait_is_as_long_as_what_is_sent_again_usually_takes(repaired):
             at = repaired.out[-1].header.sequence + 1
             repaired.send(at + 1)
             repaired.send(at, after_ns=took_ms * MS, flags=Flags.RESENT)
+            for n in range(2, 12):
+                repaired.send(at + n)
         at = repaired.out[-1].header.sequence + 1
         repaired.send(at + 1)
         repaired.now_ns += took_ms * MS
@@ -173,6 +174,80 @@ def test_the_wait_is_as_long_as_what_is_sent_again_usually_takes(repaired):
         repaired.now_ns += (wait_ms - took_ms) * MS
         assert repaired.wants()
         repaired.send(at, flags=Flags.RESENT)
+
+
+def test_where_nothing_comes_again_no_hole_waits_for_a_while(repaired):
+    """Of two grounds one alone is listened to: each loss would cost the other a picture that comes later."""
+    at = 4 + ORDERLY_UNITS
+
+    def fly(seconds: int) -> None:
+        nonlocal at
+        for _ in range(15 * seconds):
+            repaired.send(at)
+            at += 1
+
+    def lose(*, waits: bool) -> None:
+        nonlocal at
+        assert (repaired.send(at + 1) == []) == waits
+        for n in (2, 3, 4):
+            repaired.send(at + n)
+        assert repaired.wants()
+        repaired.send(at + 5, key=True)
+        at += 6
+
+    for _ in range(3):
+        lose(waits=True)
+    fly(18)
+    lose(waits=False)
+    fly(3)
+    lose(waits=True)
+    fly(38)
+    lose(waits=False)
+    repaired.send(at + 1)
+    repaired.send(at, after_ns=MS, flags=Flags.RESENT)  # it comes after all
+    repaired.send(at + 2, key=True)
+    at += 3
+    lose(waits=True)
+
+
+@pytest.mark.parametrize(
+    ("step_ms", "lost", "round_trip_ms", "waits"),
+    [
+        (66, 1, 60, True),
+        (66, 3, 60, True),
+        (66, 4, 60, False),
+        (33, 6, 60, True),
+        (16, 9, 60, False),
+        (133, 1, 60, True),
+        (133, 2, 60, False),
+        (200, 1, 60, False),
+        (66, 1, 570, True),
+        (66, 1, 600, False),
+    ],
+)
+def test_no_hole_waits_that_the_edge_has_no_room_or_no_time_to_fill(
+    ground, step_ms, lost, round_trip_ms, waits
+):
+    """At two pictures a second, and behind a satellite, each loss would cost a keyframe that comes later."""
+    ground.core.round_trip_ns = round_trip_ms * MS
+    for sequence in range(2 * ORDERLY_UNITS):
+        ground.send(sequence, key=sequence == 0, after_ns=step_ms * MS)
+    ground.send(2 * ORDERLY_UNITS + lost, after_ns=(1 + lost) * step_ms * MS)
+    assert (ground.held() > 0) == waits
+    assert len(ground.core.missing) == lost * waits
+    assert ground.wants() != waits
+
+
+def test_without_a_keyframe_only_what_may_be_one_is_asked_for(repaired):
+    """Frames that nobody can show would take the room of the keyframe that is awaited."""
+    at = 4 + ORDERLY_UNITS
+    repaired.send(at + 5)
+    assert repaired.wants()
+    repaired.core.keyframe_requested(repaired.now_ns)
+    assert repaired.send(at + 7, after_ns=50 * MS) == [("skip", at + 7)]
+    assert repaired.send(at + 9, after_ns=50 * MS) == []
+    assert repaired.core.missing == (at + 8,)
+    assert repaired.send(at + 8, after_ns=50 * MS, key=True, flags=Flags.RESENT)[-1] == ("decode", at + 9)
 
 
 def test_a_keyframe_ends_the_wait_and_nothing_long_is_waited_for(repaired):

@@ -182,3 +182,8 @@ class Feedback(Message):
     missing_base: tuple[int, ...] = wire_field(ListOf(Int(0, U32), MAX_MISSING_BASE), default=())
     """Sequences of ``base`` behind which newer ones wait; the edge may send each once more. None where they are more:
     a keyframe is the shorter way then."""
+
+    @property
+    def lost_so_far(self) -> int:
+        """With what is missing now."""
+        return self.lost + len(self.missing_base)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import msgpack
@@ -18,6 +19,7 @@ from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
     READ_VERSIONS,
     BaseHeader,
+    Flags,
     Info,
     Message,
     PoseReport,
@@ -75,6 +77,26 @@ def test_another_detector_sees_something_else_at_the_speed_that_is_asked_for(dra
     assert base != [row for row in lines(drawn.folder / "flight.csv") if row[-1] == "base"]
     assert {row[6] for row in base} == {"moving"}
     assert len(list((tmp_path / "new").glob("*.rrd"))) == 1
+
+
+def test_what_came_again_in_flight_comes_again(drawn, tmp_path, capsys):
+    """Live nobody asked for a keyframe: the replay would be dark up to the next that came by itself."""
+    log, at = MessageLog(tmp_path / "lossy.hvtlog", most_bytes=10**9), 40
+    messages = list(read_log(drawn.folder / "flight.hvtlog"))
+    base = [one for one in messages if one.key.endswith(f"/{Channel.BASE}")]
+    before, lost, behind = base[at - 1 : at + 2]
+    header = BaseHeader.parse(lost.attachment, lost.payload)
+    again = replace(header, flags=header.flags | Flags.RESENT).pack(lost.payload)
+    for one in messages:
+        if one is not lost:
+            log.log(replace(one, received_ns=before.received_ns + SECOND_NS // 15) if one is behind else one)
+        if one is behind:
+            log.log(replace(lost, attachment=again, received_ns=before.received_ns + SECOND_NS // 10))
+    log.close()
+    words = ("--detector", "motion", "--classifier", "none", "--summary", tmp_path / "again.json", *SETTINGS)
+    replay(capsys, tmp_path / "lossy.hvtlog", *words)
+    summary = json.loads((tmp_path / "again.json").read_text(encoding="utf-8"))
+    assert [summary[name] for name in ("frames_decoded", "lost", "resent")] == [FRAMES, 0, 1]
 
 
 def test_an_edge_that_nobody_wants_is_not_shown(drawn, tmp_path, capsys):
