@@ -136,7 +136,7 @@ def test_a_recording_holds_video_and_stills(drawn, tmp_path, capsys):
         assert header.box_source_px == first[number].box_source_px
         assert (header.frame_index, header.class_name) == (
             first[number].frame_index,
-            first[number].class_name,
+            first[number].named(recorded.info.class_names).class_name,
         )
     outcome = replay(
         capsys, folder / "flight.rrd", "--tracks", tmp_path / "again.csv", "--record", tmp_path, *SETTINGS
