@@ -12,7 +12,8 @@ from hvt_common.protocol.messages import MAX_MISSING_BASE, ControlRequest, Feedb
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_ground.link.reassemble import REORDER_UNITS, RESEND_UNITS, Arrival, Reassembler
+from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
+from hvt_ground.link.repair import RESEND_UNITS
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
 from lab.fuzz.mutate import changed_values, each_part, joined, parted
@@ -47,7 +48,7 @@ def _base_messages(data: bytes) -> Iterator[tuple[_Header, int]]:
 
 def _reassembly(data: bytes) -> None:
     core: Reassembler = Reassembler()
-    core.round_trip_ns = 60 * _MS if len(data) % _STEP.size else None
+    core.repair.round_trip_ns = 60 * _MS if len(data) % _STEP.size else None
     now_ns, last = 5_000 * _MS, None
     for header, wait_ms in _base_messages(data):
         now_ns += wait_ms * _MS
@@ -55,7 +56,7 @@ def _reassembly(data: bytes) -> None:
             last = _checked(arrival, last)
         if core.wants_keyframe(now_ns):
             core.keyframe_requested(now_ns)
-        assert len(core._held) <= (RESEND_UNITS if core.round_trip_ns else REORDER_UNITS)
+        assert len(core._held) <= (RESEND_UNITS if core.repair.round_trip_ns else REORDER_UNITS)
         assert len(core.missing) <= MAX_MISSING_BASE
         assert len(core._left) <= 16
 

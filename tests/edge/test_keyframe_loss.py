@@ -58,7 +58,7 @@ class Ground:
         """Take in what has come; whether to ask for a keyframe."""
         while self.air and self.air[0][0] <= now_ns:
             self._show(self.reassembler.accept(self.air.pop(0)[1], b"", now_ns=now_ns), now_ns)
-        if self.reassembler.round_trip_ns is not None:
+        if self.reassembler.repair.round_trip_ns is not None:
             self._show(self.reassembler.overdue(now_ns=now_ns), now_ns)
         if wants := self.reassembler.wants_keyframe(now_ns):
             self.reassembler.keyframe_requested(now_ns)
@@ -104,7 +104,7 @@ class Minute:
             Ground(number, loss=self.loss, seed=self.seed, way_ns=way_ns) for number in range(self.grounds)
         ]
         self.in_flight = BaseInFlight()
-        self.sees[0].reassembler.round_trip_ns = 2 * way_ns if self.resends else None
+        self.sees[0].reassembler.repair.round_trip_ns = 2 * way_ns if self.resends else None
         asks: list[tuple[int, Callable[[int], None]]] = []
         self.sent = self.resent = next_ns = 0
         for now_ns in range(0, 60_000 * MS, STEP_NS):

@@ -12,8 +12,7 @@ when it is twice as old as any was whose unit came late: at once where none of `
 longer matters.
 
 *Repair.* An edge that is told what is `missing` sends it again. A hole waits for that, and where it does not come in
-the time that it usually takes, at first a round trip and some, for a keyframe as well: whichever is first. No hole
-waits that the edge has no room to fill, nor on a link where nothing came again of late: the keyframe would be later.
+the time that it usually takes, at first a round trip and some, for a keyframe as well: whichever is first (`Repair`).
 
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
@@ -34,9 +33,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
-from hvt_common.protocol.messages import MAX_MISSING_BASE, BaseHeader, Flags
+from hvt_common.protocol.messages import BaseHeader, Flags
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
+from hvt_ground.link.repair import RESEND_UNITS, RESEND_WAIT_NS, Repair
 
 T = TypeVar("T")
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
@@ -46,14 +46,6 @@ its numbers cannot be true."""
 
 REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
-RESEND_UNITS, RESEND_WAIT_NS = 24, 700_000_000
-"""So many units, and so long, wait at most behind a hole that the edge was told of."""
-_RESEND_SLACK_NS = 120_000_000
-"""Beyond the round trip, for the first: a resent unit waits behind what the link already holds."""
-_MOST_INTERVAL_NS, _MOST_HOLE_NS = 160_000_000, 210_000_000
-"""From one unit to the next, and of all of a hole: more would be more of a second's bytes than are sent again."""
-_UNANSWERED, _UNANSWERED_NS, _MOST_UNANSWERED_NS = 3, 20_000_000_000, 640_000_000_000
-"""After so many holes in a row for which nothing came again none waits for so long; then one, and twice as long."""
 ORDERLY_UNITS = 30
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
@@ -114,8 +106,7 @@ class Reassembler(Generic[T]):
     """
 
     def __init__(self) -> None:
-        self.round_trip_ns: int | None = None
-        """To the edge and back, for what it resends; None where nobody asks it to."""
+        self.repair = Repair()
         self.counters = StreamCounters()
         self._session: int | None = None
         self._adopted_ns: int | None = None
@@ -133,15 +124,9 @@ class Reassembler(Generic[T]):
         self._held: dict[int, Arrival[T]] = {}
         self._synced = False
         self._progress_ns = 0
-        self._interval_ns = 0  # about the time between two units of the present session
-        self._newest = (0, 0)  # its highest sequence, and when that came
         self._unshown = False  # something came since the last progress that could not be used
         self._hole_ns = 0  # when the newest hole that was given up was first seen
         self._late_ns = 0  # how old a hole ever was when its unit came
-        self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
-        """Such holes; the time until which none waits; for how long none will."""
-        self._resend_ns: tuple[int, int] | None = None
-        """How old one is when the unit comes that was sent again, and by how much that differs: of late, mean."""
         self._taken = 0
         self._quiet_until_ns = 0  # no request goes before
         self._requested_ns = self._answer_ns = (
@@ -156,7 +141,7 @@ class Reassembler(Generic[T]):
             return [self._judged(unit, "foreign")]
         if self._adopted_ns is None or header.session_id != self._session:
             duplicate = self._is_duplicate(header.session_id, now_ns)
-            patience_ns = max(SILENCE_NS, 3 * self._interval_ns)
+            patience_ns = max(SILENCE_NS, 3 * self.repair.interval_ns)
             return self._accept_outsider(
                 unit,
                 "foreign",
@@ -170,29 +155,21 @@ class Reassembler(Generic[T]):
             return self._accept_outsider(unit, "stale", patience_ns=RESTART_SILENCE_NS)
         if not self._plausible(header, now_ns):
             return self._accept_outsider(unit, "implausible", patience_ns=RESTART_SILENCE_NS)
-        if (units := header.sequence - self._newest[0]) > 0:
-            self._interval_ns = (3 * self._interval_ns + (now_ns - self._newest[1]) // units) // 4
-            self._newest = header.sequence, now_ns
+        self.repair.came(header.sequence, now_ns)
         self._held[header.sequence] = unit
         return self.overdue(now_ns=now_ns)
 
     @property
     def missing(self) -> tuple[int, ...]:
         """The sequences behind which newer units wait, where it may help that the edge sends them again."""
-        newest = max(self._held, default=self._next - 1)
-        count = newest + 1 - self._next - len(self._held)
-        if self.round_trip_ns is None or not 0 < count <= MAX_MISSING_BASE:
+        if not self._held:
             return ()
-        if self.round_trip_ns + _RESEND_SLACK_NS > RESEND_WAIT_NS:
-            return ()
-        if self._interval_ns > _MOST_INTERVAL_NS or count * self._interval_ns > _MOST_HOLE_NS:
+        newest, since_ns = max(self._held), min(unit.received_ns for unit in self._held.values())
+        if not self.repair.waits(newest + 1 - self._next - len(self._held), since_ns):
             return ()
         # With no keyframe before it, what is missing is of use only where it may be the keyframe that was requested.
-        first_ns = min(unit.received_ns for unit in self._held.values())
-        useful = self._synced or (
-            self._requests_in_gap and first_ns - self._requested_ns >= self.round_trip_ns
-        )
-        if not useful or first_ns < self._until_ns:
+        crossed_ns = self._requested_ns + (self.repair.round_trip_ns or 0)
+        if not (self._synced or (self._requests_in_gap and since_ns >= crossed_ns)):
             return ()
         return tuple(one for one in range(self._next, newest) if one not in self._held)
 
@@ -255,24 +232,17 @@ class Reassembler(Generic[T]):
             if (
                 lost
                 and first > keyframe
-                and len(self._held) <= (RESEND_UNITS if self._repairs else REORDER_UNITS)
+                and len(self._held) <= (RESEND_UNITS if self.missing else REORDER_UNITS)
                 and self._hole_age_ns(now_ns) < self._patience_ns
             ):
                 break
             if lost:
-                self._note_unanswered(now_ns)
+                if self.missing:
+                    self.repair.unanswered(self._hole_age_ns(now_ns), now_ns)
                 self._give_up(lost, now_ns)
             verdict = self._take(unit := self._held.pop(first))
             released.append(self._judged(unit, verdict, lost_before=lost))
         return released
-
-    def _note_unanswered(self, now_ns: int) -> None:
-        # Of a hole that ends unfilled, after it has waited longer than it usually takes.
-        if self._repairs and self._hole_age_ns(now_ns) >= self._alone_ns:
-            self._unanswered += 1
-            if self._unanswered >= _UNANSWERED:
-                self._until_ns = now_ns + self._pause_ns
-                self._pause_ns = min(2 * self._pause_ns, _MOST_UNANSWERED_NS)
 
     def _give_up(self, lost: int, now_ns: int) -> None:
         self._hole_ns = now_ns - self._hole_age_ns(now_ns)
@@ -314,23 +284,12 @@ class Reassembler(Generic[T]):
     @property
     def _patience_ns(self) -> int:
         usual_ns = REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
-        return RESEND_WAIT_NS if self._repairs else usual_ns
-
-    @property
-    def _repairs(self) -> bool:
-        # Whether the edge is to send again what the present hole lacks.
-        return bool(self.missing)
+        return RESEND_WAIT_NS if self.missing else usual_ns
 
     @property
     def _alone_ns(self) -> int:
         # How long a hole waits before a keyframe is wanted.
-        if self.round_trip_ns is None or not self._repairs:
-            return self._patience_ns
-        usual_ns = self.round_trip_ns + _RESEND_SLACK_NS
-        if self._resend_ns is not None:
-            mean_ns, differs_ns = self._resend_ns
-            usual_ns = mean_ns + max(2 * differs_ns, mean_ns // 8)
-        return min(RESEND_WAIT_NS, usual_ns)
+        return self.repair.usual_ns if self.missing else self._patience_ns
 
     def _note_late(self, header: BaseHeader, now_ns: int) -> None:
         # The unit of a hole comes after all, before or after that was given up.
@@ -344,10 +303,7 @@ class Reassembler(Generic[T]):
         else:
             return
         if header.flags & Flags.RESENT:
-            mean_ns, differs_ns = self._resend_ns or (late_ns, late_ns // 4)
-            differs_ns = (3 * differs_ns + abs(late_ns - mean_ns)) // 4
-            self._resend_ns = (7 * mean_ns + late_ns) // 8, differs_ns
-            self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
+            self.repair.came_again(late_ns)
         else:
             self._late_ns = max(self._late_ns, late_ns)
 
@@ -397,7 +353,8 @@ class Reassembler(Generic[T]):
         self._left.pop(header.session_id, None)
         self._session, self._adopted_ns = header.session_id, now_ns
         self._outsiders.clear()
-        self._interval_ns, self._progress_ns, self._newest = 0, now_ns, (header.sequence, now_ns)
+        self._progress_ns = now_ns
+        self.repair.begin(header.sequence, now_ns)
         self._first = self._next = header.sequence
         self._last_frame, self._recent = header.frame_index - 1, 0
 

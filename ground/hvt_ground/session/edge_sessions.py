@@ -216,10 +216,8 @@ class EdgeSessions:
             session.report_backlog()
         session.report_if_due()
         self._refresh_clock(session, now_ns)
-        clock = self._clock_offset.estimate
-        self.receiver.stream.round_trip_ns = (
-            None if clock is None else 2 * clock[1]
-        )  # its error is half of one
+        if clock := self._clock_offset.estimate:  # its error is half a round trip
+            self.receiver.stream.repair.round_trip_ns = 2 * clock[1]
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
             self._end_session()

@@ -15,13 +15,13 @@ from hvt_ground.link.reassemble import (
     DUPLICATE_SILENCE_NS,
     ORDERLY_UNITS,
     REORDER_WAIT_NS,
-    RESEND_UNITS,
     RESTART_SILENCE_NS,
     SEQUENCE_SLACK,
     SILENCE_NS,
     Arrival,
     Reassembler,
 )
+from hvt_ground.link.repair import RESEND_UNITS
 from rigs.footprint import footprint_bytes
 
 FRAME_NS = 1_000_000_000 // 15
@@ -119,7 +119,7 @@ def repaired(running):
     """The same, orderly for long, with an edge that sends again what is missing, 60 ms away."""
     for sequence in range(4, 4 + ORDERLY_UNITS):
         running.send(sequence)
-    running.core.round_trip_ns = 60 * MS
+    running.core.repair.round_trip_ns = 60 * MS
     return running
 
 
@@ -229,7 +229,7 @@ def test_no_hole_waits_that_the_edge_has_no_room_or_no_time_to_fill(
     ground, step_ms, lost, round_trip_ms, waits
 ):
     """At two pictures a second, and behind a satellite, each loss would cost a keyframe that comes later."""
-    ground.core.round_trip_ns = round_trip_ms * MS
+    ground.core.repair.round_trip_ns = round_trip_ms * MS
     for sequence in range(2 * ORDERLY_UNITS):
         ground.send(sequence, key=sequence == 0, after_ns=step_ms * MS)
     ground.send(2 * ORDERLY_UNITS + lost, after_ns=(1 + lost) * step_ms * MS)
@@ -604,7 +604,7 @@ units = st.tuples(st.booleans(), st.booleans(), st.integers(0, 2), st.sampled_fr
 def test_no_pattern_of_loss_and_reordering_reaches_the_decoder(pattern, copies_late, step_ms, round_trip_ns):
     """Some unlucky order of packets would break the picture without anyone noticing."""
     ground = Ground()
-    ground.core.round_trip_ns = round_trip_ns
+    ground.core.repair.round_trip_ns = round_trip_ns
     arrivals = []
     for sequence, (key, lost, copies, late) in enumerate(pattern):
         if not lost:
