@@ -79,8 +79,10 @@ _WORKING_SIDE_PX: Final = 320
 _MAX_CORNERS: Final = 250
 _CORNER_QUALITY: Final = 0.01
 _CORNER_DISTANCE_PX: Final = 7
-_FLOW_WINDOW_PX: Final = 15
+_FLOW_WINDOW_PX: Final = 11
+"""With 15, and OpenCV's 30 steps, it takes 2.5 times as long, and pictures lie no better on each other."""
 _FLOW_LEVELS: Final = 3
+_FLOW_UNTIL: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 _RANSAC_PX: Final = 1.0
 # Fewer corners that agree than this, or a smaller share of them, is chance: objects, noise, an empty sky.
 _LEAST_INLIERS: Final = 12
@@ -177,7 +179,13 @@ def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
         return None
     window = (_FLOW_WINDOW_PX, _FLOW_WINDOW_PX)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        previous, current, corners, np.empty_like(corners), winSize=window, maxLevel=_FLOW_LEVELS
+        previous,
+        current,
+        corners,
+        np.empty_like(corners),
+        winSize=window,
+        maxLevel=_FLOW_LEVELS,
+        criteria=_FLOW_UNTIL,
     )
     tracked = found.ravel() == 1
     if np.count_nonzero(tracked) < _LEAST_INLIERS:
