@@ -383,7 +383,7 @@ def _arrival_bps(first: Progress, last: Progress) -> float:
 
 
 class ReconfigurationTrigger:
-    """Whether it is worth a keyframe and some 35 ms to open x265 at another rate. Time is an argument.
+    """Whether it is worth a keyframe to open x265 at another rate. Time is an argument.
 
     Until then a base stream that is too fast takes from the stills, and then drops frames.
     """
