@@ -33,8 +33,6 @@ _MOST_SETS, _MOST_SET_BYTES = 32, 4096
 """A camera has one of each kind; more than this is no camera's."""
 _DELIMITER, _SLICES_END = 35, 32
 """The NAL unit types of an access unit delimiter, and behind the last of a slice (H.265, table 7-1)."""
-_MOST_BYTES = {32: 4096, 33: 4096, 34: 4096, _DELIMITER: 8, 36: 8, 37: 8, 38: 2**20, 39: 512, 40: 512}
-"""Of units that belong to no picture: parameter sets, ends, filler, SEI. A longer one may hold a damaged slice."""
 
 
 class CameraUnits:
@@ -56,20 +54,12 @@ class CameraUnits:
         self._sets: dict[int, list[bytes]] = {}
         self._note(sets)
 
-    def is_empty(self, packet: bytes) -> bool:
-        """Whether a packet holds parameter sets, filler or the like, and nothing of a picture; its sets count."""
-        try:
-            nals = nal_units(self._annex_b(packet))
-            if not nals or any(len(one) > _MOST_BYTES.get(nal_kind(one), 0) for one in nals):
-                return False
-            self._note(nals)
-        except ValueError:
-            return False
-        return True
-
     def unit(self, packet: bytes) -> CameraUnit:
         """The access unit of one picture. `ValueError` with the fault for anything else."""
-        data = without_filler(self._annex_b(packet))
+        data = packet
+        if self._length_bytes:
+            data = b"".join(LONG_START + one for one in _split(packet, self._length_bytes))
+        data = without_filler(data)
         nals = nal_units(data)
         slices = [one for one in nals if nal_kind(one) < _SLICES_END]
         pictures = sum(len(one) > 2 and bool(one[2] & _FIRST_OF_PICTURE) for one in slices)
@@ -81,11 +71,6 @@ class CameraUnits:
         if {nal_kind(one) for one in nals} >= PARAMETER_SETS:
             return CameraUnit(data, keyframe=True)
         return CameraUnit(self._with_sets(data, nals), keyframe=True)
-
-    def _annex_b(self, packet: bytes) -> bytes:
-        if not self._length_bytes:
-            return packet
-        return b"".join(LONG_START + one for one in _split(packet, self._length_bytes))
 
     def _with_sets(self, data: bytes, nals: list[bytes]) -> bytes:
         # The keyframe with all its sets, in order: behind the delimiter, which is the first where there is one.
@@ -194,10 +179,6 @@ class CameraDecoder:
     def expect(self, size: tuple[int, int]) -> None:
         """From now on a picture of another size (width, height) is not taken."""
         self._size = size
-
-    def is_empty(self, packet: bytes) -> bool:
-        """Whether there is no picture in it to decode, nor one that is missing."""
-        return self._units.is_empty(packet)
 
     def skip(self) -> None:
         """Packets are missing before the next."""

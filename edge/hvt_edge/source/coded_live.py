@@ -54,7 +54,7 @@ class CodedStreamGrabber(StreamGrabber):
 def _packets(container: Any, stream: Any, decoder: CameraDecoder) -> Iterator[Shot]:
     stamped = is_stamped(container)
     for packet in packets_of(container, stream):
-        if packet.size and not decoder.is_empty(bytes(packet)):
+        if packet.size:
             at_s = None if packet.pts is None else float(packet.pts * packet.time_base)
             taken = CameraPacket(bytes(packet), at_s, decoder)
             yield Shot(partial(_picture, taken), camera_time_ns(packet, stamped=stamped), taken)

@@ -86,8 +86,6 @@ class CodedVideoSource(ClipSource):
             for at_s, packet in packets:
                 if count == self._limit:
                     return
-                if decoder.is_empty(packet):
-                    continue
                 decoded = decoder.decode(packet)
                 if decoded is None:
                     left_out += 1

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.video.hevc import LONG_START, PARAMETER_SETS, BaseDecoder, nal_kind, nal_units, parameter_sets
-from hvt_edge.source.camera_stream import CameraDecoder, CameraUnits
+from hvt_edge.source.camera_stream import CameraUnits
 from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip
 
 
@@ -45,24 +45,8 @@ def test_filler_is_left_out(tmp_path):
     units = CameraUnits(b"")
     found = [units.unit(packet + filler) for packet in packets]
     assert [nal_units(one.data) for one in found] == [nal_units(packet) for packet in packets]
-
-
-def test_a_packet_without_a_picture_costs_none(tmp_path):
-    """Filler or parameter sets in a packet of their own would darken the screen up to the next keyframe."""
-    packets = packets_of(write_clip(tmp_path / "a.hevc"))
-    filler = LONG_START + bytes([38 << 1, 1]) + b"\xff" * 5000 + b"\x80"
-    bare = b"".join(LONG_START + one for one in nal_units(packets[10]) if nal_kind(one) not in PARAMETER_SETS)
-    decoder = CameraDecoder(CameraUnits(b""))
-    for empty in (filler, parameter_sets(packets[0]), LONG_START + bytes([39 << 1, 1]) + b"\x04" * 20):
-        assert decoder.is_empty(empty)
-    assert decoder.decode(bare)[0].keyframe, "its sets came before it"
-    for packet in packets[11:14]:
-        assert not decoder.is_empty(packet)
-        assert decoder.is_empty(filler)
-        assert decoder.decode(packet) is not None
-    delimited = LONG_START + bytes([35 << 1, 1, 0x50])
-    for damaged in (b"", b"\xff" * 40, delimited + packets[14][4:], parameter_sets(packets[0]) * 40):
-        assert not decoder.is_empty(damaged)
+    with pytest.raises(ValueError, match="holds 0 pictures"):
+        units.unit(filler)
 
 
 def test_sets_that_came_once_are_put_before_later_keyframes(tmp_path):
