@@ -12,7 +12,7 @@ from hvt_common.protocol.messages import MAX_MISSING_BASE, ControlRequest, Feedb
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
+from hvt_ground.link.reassemble import REORDER_UNITS, RESEND_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
 from lab.fuzz.mutate import changed_values, each_part, joined, parted
@@ -55,7 +55,7 @@ def _reassembly(data: bytes) -> None:
             last = _checked(arrival, last)
         if core.wants_keyframe(now_ns):
             core.keyframe_requested(now_ns)
-        assert len(core._held) <= (24 if core.repair.round_trip_ns else REORDER_UNITS)
+        assert len(core._held) <= (RESEND_UNITS if core.repair.round_trip_ns else REORDER_UNITS)
         assert len(core.missing) <= MAX_MISSING_BASE
         assert len(core._left) <= 16
 

@@ -212,7 +212,7 @@ def _info(session_id: int, data: bytes, *, edge: str) -> Info:
 
 def _still(session_id: int, number: int, data: bytes) -> ReceivedStill:
     stored = parse_backlog_still(data)
-    header = RoiHeader.parse(stored.attachment, stored.payload, versions=READ_VERSIONS)
+    header = RoiHeader.parse(stored.attachment, stored.payload, versions=READ_VERSIONS).named(())
     if header.session_id != session_id or header.sequence != number:
         raise WireError(f"stored still {number} has another number inside")
     if not header.flags & Flags.STORED or header.capture_ns < 0:

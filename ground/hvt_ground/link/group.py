@@ -182,7 +182,7 @@ class GroundGroup:
                 return
             page = reply.ok.payload.to_bytes().decode(errors="replace")
             with self._lock:
-                if member in self._members and (not page or page.startswith(("http://", "https://"))):
+                if member in self._members and (not page or page.lower().startswith(("http://", "https://"))):
                     self._pages[member] = page
 
         def end() -> None:

@@ -33,10 +33,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
-from hvt_common.protocol.messages import BaseHeader, Flags
+from hvt_common.protocol.messages import MAX_MISSING_BASE, BaseHeader, Flags
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
-from hvt_ground.link.repair import RESEND_UNITS, RESEND_WAIT_NS, Repair
 
 T = TypeVar("T")
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
@@ -46,6 +45,15 @@ its numbers cannot be true."""
 
 REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
+RESEND_UNITS, RESEND_WAIT_NS = 24, 700_000_000
+"""So many units, and so long, wait at most behind a hole that the edge was told of."""
+_SLACK_NS = 120_000_000
+"""Beyond the round trip, for the first: a resent unit waits behind what the link already holds."""
+_MOST_INTERVAL_NS, _MOST_HOLE_NS = 160_000_000, 210_000_000
+"""From one unit to the next, and of all of a hole: more would be more of a second's bytes than are sent again."""
+_UNANSWERED, _UNANSWERED_NS, _MOST_UNANSWERED_NS = 3, 20_000_000_000, 640_000_000_000
+"""After so many holes in a row for which nothing came again none waits for so long; then one, and twice as long."""
+_MUCH_SOONER = 1.25
 ORDERLY_UNITS = 30
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
@@ -97,6 +105,78 @@ class StreamCounters:
     corrupt: int = 0
     """Reported by the caller: the header could not be read, or the CRC was wrong."""
     keyframe_requests: int = 0
+
+
+class Repair:
+    """Whether a hole is worth a wait for what the edge sends again, and how long.
+
+    It is not where the edge has no room to fill it, where the round trip is too long, nor on a link where nothing
+    came again of late: a keyframe, which a hole costs otherwise, would only be later.
+    """
+
+    def __init__(self) -> None:
+        self.round_trip_ns: int | None = None
+        """To the edge and back; None where nobody tells it what is missing."""
+        self.begin(0, 0)
+
+    def begin(self, sequence: int, now_ns: int) -> None:
+        """The first unit of a session comes."""
+        self.interval_ns = 0
+        """About the time between two units."""
+        self._newest = (sequence, now_ns)
+        """The highest sequence, and when it came."""
+        self._took_ns: tuple[int, int] | None = None
+        """How old a hole is when its unit comes that was sent again, and by how much that differs: of late, mean."""
+        self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
+        """Holes without one; the time until which none waits; for how long none will."""
+
+    def came(self, sequence: int, now_ns: int) -> None:
+        """Another unit comes."""
+        if (units := sequence - self._newest[0]) > 0:
+            step_ns = min((now_ns - self._newest[1]) // units, 2 * _MOST_INTERVAL_NS)  # more is a pause
+            self.interval_ns = (3 * self.interval_ns + step_ns) // 4
+            self._newest = sequence, now_ns
+
+    def came_again(self, late_ns: int) -> None:
+        """A unit that was sent again fills a hole that waits, and is so old."""
+        mean_ns, differs_ns = self._took_ns or (late_ns, late_ns // 4)
+        differs_ns = (3 * differs_ns + abs(late_ns - mean_ns)) // 4
+        self._took_ns = (7 * mean_ns + late_ns) // 8, differs_ns
+        self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
+
+    def unanswered(self, age_ns: int, now_ns: int) -> None:
+        """A hole that waited ends unfilled; it was so old."""
+        if age_ns < self.usual_ns:
+            return
+        self._unanswered += 1
+        if self._unanswered >= _UNANSWERED:
+            self._until_ns = now_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, _MOST_UNANSWERED_NS)
+
+    def waits(self, count: int, since_ns: int) -> bool:
+        """Whether a hole of so many units waits, behind which the first has come at ``since_ns``."""
+        return (
+            self.round_trip_ns is not None
+            and self.round_trip_ns + _SLACK_NS <= min(RESEND_WAIT_NS, RESEND_UNITS * self.interval_ns)
+            and 0 < count <= MAX_MISSING_BASE
+            and self.interval_ns <= _MOST_INTERVAL_NS
+            and count * self.interval_ns <= _MOST_HOLE_NS
+            and since_ns >= self._until_ns
+        )
+
+    @property
+    def mean_ns(self) -> int:
+        """How long it takes in the mean; 0 before the first."""
+        return 0 if self._took_ns is None else self._took_ns[0]
+
+    @property
+    def usual_ns(self) -> int:
+        """How long that usually takes: then a keyframe is wanted as well."""
+        usual_ns = (self.round_trip_ns or 0) + _SLACK_NS
+        if self._took_ns is not None:
+            mean_ns, differs_ns = self._took_ns
+            usual_ns = mean_ns + max(2 * differs_ns, mean_ns // 8)
+        return min(RESEND_WAIT_NS, usual_ns)
 
 
 class Reassembler(Generic[T]):
@@ -162,16 +242,16 @@ class Reassembler(Generic[T]):
     @property
     def missing(self) -> tuple[int, ...]:
         """The sequences behind which newer units wait, where it may help that the edge sends them again."""
-        if not self._held:
+        if not self._held or not self._synced:
             return ()
         newest, since_ns = max(self._held), min(unit.received_ns for unit in self._held.values())
         if not self.repair.waits(newest + 1 - self._next - len(self._held), since_ns):
             return ()
-        # With no keyframe before it, what is missing is of use only where it may be the keyframe that was requested.
-        crossed_ns = self._requested_ns + (self.repair.round_trip_ns or 0)
-        if not (self._synced or (self._requests_in_gap and since_ns >= crossed_ns)):
-            return ()
         return tuple(one for one in range(self._next, newest) if one not in self._held)
+
+    def named(self, now_ns: int) -> tuple[int, ...]:
+        """Those to tell the edge: not before they are as late as units usually are that come by themselves."""
+        return self.missing if self._hole_age_ns(now_ns) >= self._reorder_ns else ()
 
     @property
     def newest_held(self) -> Arrival[T] | None:
@@ -282,29 +362,34 @@ class Reassembler(Generic[T]):
         return max((now_ns - unit.received_ns for unit in self._held.values()), default=0)
 
     @property
+    def _reorder_ns(self) -> int:
+        return REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
+
+    @property
     def _patience_ns(self) -> int:
-        usual_ns = REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
-        return RESEND_WAIT_NS if self.missing else usual_ns
+        return RESEND_WAIT_NS if self.missing else self._reorder_ns
 
     @property
     def _alone_ns(self) -> int:
-        # How long a hole waits before a keyframe is wanted.
-        return self.repair.usual_ns if self.missing else self._patience_ns
+        # How long a hole waits before a keyframe is wanted: no longer where that is there much sooner.
+        slow = 0 < _MUCH_SOONER * self._answer_ns < self.repair.mean_ns
+        return self._reorder_ns if slow or not self.missing else max(self._reorder_ns, self.repair.usual_ns)
 
     def _note_late(self, header: BaseHeader, now_ns: int) -> None:
-        # The unit of a hole comes after all, before or after that was given up.
+        # The unit of a hole comes after all, before or after that was given up: of use is a resent one before alone.
         sequence = header.sequence
         if self._held and self._next <= sequence < max(self._held) and sequence not in self._held:
             late_ns = self._hole_age_ns(now_ns)
+            if header.flags & Flags.RESENT:
+                self.repair.came_again(late_ns)
+                return
         elif max(self._first, self._next - SEQUENCE_SLACK) <= sequence < self._next and not self._has_been(
             sequence
         ):
             late_ns = now_ns - self._hole_ns
         else:
             return
-        if header.flags & Flags.RESENT:
-            self.repair.came_again(late_ns)
-        else:
+        if not header.flags & Flags.RESENT:
             self._late_ns = max(self._late_ns, late_ns)
 
     # Between sessions.
@@ -321,7 +406,7 @@ class Reassembler(Generic[T]):
     ) -> list[Arrival[T]]:
         # A unit that does not continue the session: adopted with a keyframe when the session is silent.
         header, now_ns = unit.header, unit.received_ns
-        if header.sequence < self._left.get(header.session_id, 0):
+        if header.sequence < self._left.get(header.session_id, 0) or header.flags & Flags.RESENT:
             return [self._judged(unit, "stale")]
         if self._adopted_ns is None:
             too_soon, refusal = False, "skip"

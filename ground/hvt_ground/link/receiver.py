@@ -158,6 +158,10 @@ class Receiver:
         """Access units that have waited long enough behind a hole; ``pending``: messages wait to be received."""
         return self.stream.overdue(now_ns=self._uptime.at(self._clock(), pending=pending))
 
+    def missing(self) -> tuple[int, ...]:
+        """The access units to tell the edge of (`Reassembler.named`)."""
+        return self.stream.named(self._uptime.at(self._clock(), pending=False))
+
     def take_keyframe_request(self, *, pending: bool) -> bool:
         """Whether to request a keyframe now, which is noted; ``pending``: messages wait to be received."""
         at_ns = self._uptime.at(self._clock(), pending=pending)

@@ -158,7 +158,8 @@ class Reception:
     def note_held(self, missing: tuple[int, ...], newest: BaseHeader | None, *, at_ns: int) -> bool:
         """Access units wait behind what is ``missing``, ``newest`` since ``at_ns``; whether to report that at once.
 
-        They count as received: until its frames do, the edge holds the next ones.
+        They count as received: until its frames do, the edge holds the next ones. It takes what is up to the newest
+        and not missing for received, too.
         """
         with self._lock:
             news = not set(missing) <= set(self._missing_base)

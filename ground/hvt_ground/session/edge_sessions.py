@@ -168,15 +168,12 @@ class EdgeSessions:
 
     def _note_held(self) -> None:
         # What is missing is said at once: each moment more is one without a picture.
-        session, newest = self.session, self.receiver.stream.newest_held
+        session, missing, newest = self.session, self.receiver.missing(), self.receiver.stream.newest_held
         if session is None:
             return
-        missing: tuple[int, ...] = ()
-        header, at_ns = None, 0
-        if newest is not None and newest.header.session_id == session.info.session_id:
-            missing = self.receiver.stream.missing
-            header, at_ns = newest.header, newest.message.received_ns
-        if session.reception.note_held(missing, header, at_ns=at_ns):
+        if not missing or newest is None or newest.header.session_id != session.info.session_id:
+            session.reception.note_held((), None, at_ns=0)
+        elif session.reception.note_held(missing, newest.header, at_ns=newest.message.received_ns):
             session.report()
 
     def close(self) -> None:

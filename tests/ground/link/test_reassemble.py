@@ -15,13 +15,13 @@ from hvt_ground.link.reassemble import (
     DUPLICATE_SILENCE_NS,
     ORDERLY_UNITS,
     REORDER_WAIT_NS,
+    RESEND_UNITS,
     RESTART_SILENCE_NS,
     SEQUENCE_SLACK,
     SILENCE_NS,
     Arrival,
     Reassembler,
 )
-from hvt_ground.link.repair import RESEND_UNITS
 from rigs.footprint import footprint_bytes
 
 FRAME_NS = 1_000_000_000 // 15
@@ -203,10 +203,11 @@ def test_where_nothing_comes_again_no_hole_waits_for_a_while(repaired):
     lose(waits=True)
     fly(38)
     lose(waits=False)
+    fly(4)
     repaired.send(at + 1)
-    repaired.send(at, after_ns=MS, flags=Flags.RESENT)  # it comes after all
-    repaired.send(at + 2, key=True)
-    at += 3
+    repaired.send(at, after_ns=90 * MS, flags=Flags.RESENT)  # it comes after all
+    at += 2
+    lose(waits=True)
     lose(waits=True)
 
 
@@ -222,6 +223,8 @@ def test_where_nothing_comes_again_no_hole_waits_for_a_while(repaired):
         (133, 2, 60, False),
         (200, 1, 60, False),
         (66, 1, 570, True),
+        (16, 1, 240, True),
+        (16, 1, 420, False),
         (66, 1, 600, False),
     ],
 )
@@ -238,16 +241,68 @@ def test_no_hole_waits_that_the_edge_has_no_room_or_no_time_to_fill(
     assert ground.wants() != waits
 
 
-def test_without_a_keyframe_only_what_may_be_one_is_asked_for(repaired):
+def test_without_a_keyframe_nothing_is_asked_for_again(repaired):
     """Frames that nobody can show would take the room of the keyframe that is awaited."""
     at = 4 + ORDERLY_UNITS
     repaired.send(at + 5)
     assert repaired.wants()
+    assert repaired.send(at + 7) == [("skip", at + 7)]
+    assert repaired.core.missing == ()
+
+
+def test_on_links_that_reorder_nothing_is_asked_for_that_comes_by_itself(repaired):
+    """Of several links one may be slower: each frame of it would go twice, and every second be left out for that."""
+    at = 4 + ORDERLY_UNITS
+    for _ in range(10):
+        assert repaired.send(at + 1) == []
+        first = repaired.core.named(repaired.now_ns)
+        assert repaired.send(at, after_ns=45 * MS)[-1] == ("decode", at + 1)
+        at += 2
+    assert first == ()
+    repaired.send(at + 1)
+    assert repaired.core.named(repaired.now_ns + 89 * MS) == ()
+    assert repaired.core.named(repaired.now_ns + 90 * MS) == (at,)
+
+
+def test_what_comes_again_too_late_is_no_reason_to_wait(repaired):
+    """A full link: each hole would be dark for seven tenths of a second before a keyframe is asked for."""
+    at = 4 + ORDERLY_UNITS
+    for _ in range(4):
+        repaired.send(at + 1)
+        for n in range(2, 13):
+            repaired.send(at + n)
+        repaired.send(at, after_ns=MS, flags=Flags.RESENT)  # given up before
+        repaired.send(at + 13, key=True)
+        at += 14
+    assert repaired.send(at + 1) == [("skip", at + 1)]
+
+
+def test_where_a_keyframe_is_there_sooner_it_is_asked_for_at_once(repaired):
+    """The screen would be dark for as long as the slower of the two takes."""
+    at = 4 + ORDERLY_UNITS
+    for _ in range(30):
+        repaired.send(at + 1)
+        repaired.send(at, after_ns=400 * MS, flags=Flags.RESENT)
+        for n in range(2, 12):
+            repaired.send(at + n)
+        at += 12
+    repaired.send(at + 9)  # too much is missing
+    assert repaired.wants()
     repaired.core.keyframe_requested(repaired.now_ns)
-    assert repaired.send(at + 7, after_ns=50 * MS) == [("skip", at + 7)]
-    assert repaired.send(at + 9, after_ns=50 * MS) == []
-    assert repaired.core.missing == (at + 8,)
-    assert repaired.send(at + 8, after_ns=50 * MS, key=True, flags=Flags.RESENT)[-1] == ("decode", at + 9)
+    repaired.send(at + 10, key=True, after_ns=150 * MS)
+    repaired.send(at + 11)
+    repaired.send(at + 12)
+    assert repaired.send(at + 14) == []
+    assert repaired.wants(), "both are on their way"
+
+
+def test_a_resent_keyframe_begins_no_session(repaired):
+    """After a stall the recording would be cut in two."""
+    at = 4 + ORDERLY_UNITS
+    repaired.send(at + 9)
+    repaired.now_ns += RESTART_SILENCE_NS
+    assert repaired.send(at + 2, key=True, flags=Flags.RESENT) == [("stale", at + 2)]
+    assert repaired.sessions() == 1
 
 
 def test_a_keyframe_ends_the_wait_and_nothing_long_is_waited_for(repaired):
@@ -277,10 +332,13 @@ def test_who_waits_for_a_lost_picture_is_not_silent(repaired):
 
 def test_so_many_wait_at_the_most_behind_a_hole(repaired):
     """Whoever can send would fill the memory with pictures that wait."""
-    at = 5 + ORDERLY_UNITS
+    at = 4 + ORDERLY_UNITS
+    for n in range(40):
+        repaired.send(at + n, after_ns=16 * MS)
+    at += 41
     for n in range(RESEND_UNITS):
-        assert repaired.send(at + n, after_ns=0) == []
-    assert len(repaired.send(at + RESEND_UNITS, after_ns=0)) == RESEND_UNITS + 1
+        assert repaired.send(at + n, after_ns=16 * MS) == []
+    assert len(repaired.send(at + RESEND_UNITS, after_ns=16 * MS)) == RESEND_UNITS + 1
 
 
 def test_late_join_asks_at_once_and_shows_from_the_keyframe(ground):

@@ -54,6 +54,7 @@ def damaged(data: bytes, word: bytes, *, at: int = 0, by: bytes = b"\xff" * 40) 
     # The header of each message is its kind and its length.
     end = begin = 12
     while word not in data[begin:end]:
+        assert end < len(data), f"no message has {word!r}"
         begin, end = end + 16, end + 16 + int.from_bytes(data[end + 8 : end + 16], "little")
     return data[: begin + at] + by + data[begin + at + len(by) :]
 
