@@ -206,17 +206,17 @@ class BaseInFlight:
             return bool(come)
 
     def missing(self, sequence: int, *, now_ns: int, round_trip_ns: int) -> AccessUnit | None:
-        """A unit that is worth sending once more; None where it is too old, or a keyframe was sent since.
+        """A unit that is worth sending again; None where it is too old, or a keyframe was sent since.
 
-        So is one that went once more less than a ``round_trip_ns`` ago: it may be there by now.
+        Nor is one that went again less than about one and a half ``round_trip_ns`` ago: it may be there by now.
         """
         with self._lock:
             sent_ns, unit = self._units.get(sequence, (0, None))
-            resent_ns = self._resent.get(sequence, sent_ns - _AGAIN_NS - 2 * round_trip_ns)
+            resent_ns = self._resent.get(sequence)
+            on_its_way = resent_ns is not None and now_ns - resent_ns <= _AGAIN_NS + 3 * round_trip_ns // 2
             newer = (one for at, (_, one) in self._units.items() if at > sequence)
-            if unit is None or now_ns - sent_ns > _RESEND_NS or any(one.keyframe for one in newer):
-                return None
-            return unit if now_ns - resent_ns > _AGAIN_NS + 3 * round_trip_ns // 2 else None
+            useful = now_ns - sent_ns <= _RESEND_NS and not any(one.keyframe for one in newer)
+            return unit if useful and not on_its_way else None
 
     def resent(self, sequence: int, *, now_ns: int) -> None:
         """It goes out again."""

@@ -180,8 +180,8 @@ class Feedback(Message):
     """Objects that the ground's own detector showed when it last looked at a picture, up to ``last_frame_index``.
     What only the edge's tracks or stills show does not count. -1 before it has looked."""
     missing_base: tuple[int, ...] = wire_field(ListOf(Int(0, U32), MAX_MISSING_BASE), default=())
-    """Sequences of ``base`` behind which newer ones wait; the edge may send each once more. None where they are more:
-    a keyframe is the shorter way then."""
+    """Sequences of ``base`` behind which newer ones wait; the edge may send each again. None where they are more: a
+    keyframe is the shorter way then."""
 
     @property
     def lost_so_far(self) -> int:

@@ -51,7 +51,7 @@ class Flags(IntFlag):
     STORED = 8
     """Stored at the edge while the link was down, and sent afterwards."""
     RESENT = 16
-    """Sent once more, since a ground missed it (`Feedback.missing_base`)."""
+    """Sent again, since a ground missed it (`Feedback.missing_base`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
