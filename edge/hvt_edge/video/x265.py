@@ -195,8 +195,8 @@ class SpareRate:
     _MOST_STEPS = 24.0
 
     def __init__(self, settings: EncoderSettings) -> None:
-        kbps, depth_kbit = _whole(settings)
-        self._frame_bits, self._depth_bits = 1000 * kbps / settings.fps, 1000.0 * depth_kbit
+        self._frame_bits = settings.bitrate_bps / settings.fps
+        self._depth_bits = settings.bitrate_bps * settings.vbv_s
         self._free_bits = 0.9 * self._depth_bits  # x265's ``vbv-init``
         self._steps = 0.0
 
@@ -215,7 +215,12 @@ class SpareRate:
 
 
 _QP_STEPS = 51
+_RATE_BY_DEPTH = 0.3
+"""x265 spends about this power of the depth, from 60 kbps up at 1.5 frames of depth."""
 _QP_TO_LAMBDA = 118
+_FEW_ROWS_PX = 192
+"""Up to this height there are at most three rows of the usual blocks of 64, and the rate is held from row to row. With
+blocks of 32 a picture of 320x180 uses .95 of its rate for .87, and is .4 dB better; one of 640x360 is .3 dB worse."""
 _WITHOUT_AQ = ("ultrafast", "superfast")
 """Presets without adaptive quantisation, where x265 ignores regions: a trace of it makes them count."""
 
@@ -326,9 +331,13 @@ def encoder_context(name: str) -> VideoCodecContext:
 
 
 def _whole(settings: EncoderSettings) -> tuple[int, int]:
-    # Rate and depth of the VBV as x265 takes them: kilobits a second, and kilobits.
-    kbps = max(1, settings.bitrate_bps // 1000)
-    return kbps, max(1, round(kbps * settings.vbv_s))
+    # Rate and depth of the VBV as x265 takes them: kilobits a second, and kilobits. At these depths a deeper one uses
+    # more of the rate, and from 7 to 8 kbit is 14 %: rounded alone, the bits spent would jump by 5 to 8 % there. So
+    # depth is rounded up, and what that adds is taken off the rate.
+    asked_kbit = settings.bitrate_bps / 1000 * settings.vbv_s
+    depth_kbit = max(1, math.ceil(asked_kbit))
+    kbps = settings.bitrate_bps / 1000 * min(1.0, asked_kbit / depth_kbit) ** _RATE_BY_DEPTH
+    return max(1, int(kbps)), depth_kbit
 
 
 def _opened(settings: EncoderSettings) -> VideoCodecContext:
@@ -354,6 +363,8 @@ def _opened(settings: EncoderSettings) -> VideoCodecContext:
     }
     if settings.preset in _WITHOUT_AQ:
         parameters |= {"aq-mode": 1, "aq-strength": 0.01}
+    if settings.size[1] <= _FEW_ROWS_PX:
+        parameters["ctu"] = 32
     context = encoder_context("libx265")
     context.width, context.height = settings.size
     context.pix_fmt = "yuv420p"

@@ -26,10 +26,9 @@ SAME_TOTAL = 1e-4
 """Of a total: rates that come back from another accounting are rounded."""
 _TRIES, _MORE = 7, 9
 """Of the secant, and then beside the best budget."""
-_ASIDE, _ASIDE_BPS = 0.004, 1000
-"""Of a budget, and at least: so far beside the best one the next is tried, where the curve has a step or falls. x265
-takes whole kbps, and what it leaves of them depends on each frame."""
-_USUAL_RATIO = 0.98
+_ASIDE = 0.004
+"""Of a budget: so far beside the best one the next is tried, where the curve has a step or falls."""
+_USUAL_RATIO = 0.85
 """What a video-only method spends of the budget that it is given."""
 
 
@@ -90,7 +89,9 @@ def _next(seen: dict[int, float], target: float) -> int:
     low = max((one for one, total in seen.items() if total < target), default=None)
     high = min((one for one, total in seen.items() if total >= target), default=None)
     if low is None or high is None or low >= high:
-        nearest = min(seen, key=lambda one: abs(seen[one] / target - 1))
+        by_error = min(seen, key=lambda one: abs(seen[one] / target - 1))
+        # Where all were too little, on from the highest: the nearest would be left by the same step again.
+        nearest = max(seen) if high is None else min(seen) if low is None else by_error
         return round(nearest * target / seen[nearest])
     span = math.log(seen[high] / seen[low])
     share = math.log(target / seen[low]) / span if span > 0 else 0.5
@@ -101,7 +102,7 @@ def _next(seen: dict[int, float], target: float) -> int:
 def _beside(seen: dict[int, float], target: float) -> int:
     best = min(seen, key=lambda one: abs(seen[one] / target - 1))
     side = -1 if seen[best] > target else 1
-    step = max(_ASIDE_BPS, round(_ASIDE * best))
+    step = max(1, round(_ASIDE * best))
     return next(
         one for k in count(1) for one in (best + side * k * step, best - side * k * step) if one not in seen
     )
