@@ -43,8 +43,8 @@ _FRAME_FLOOR_BITS_PER_PX = 0.0045
 # The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
-_VBV_FRAMES = 1.5
-"""At least: of 1.15, 1.3 and this x265 uses .8, .9 and .95 of its rate; with more, single frames take long to send."""
+_VBV_FRAMES, _TIGHT_VBV_FRAMES = 1.3, 1.15
+"""At least: with 1.15 x265 uses .8 of its rate, with 1.3 it uses .9; with more, a window of few frames cannot hold them."""
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
 _KEYFRAME_EVERY_S = 5.0
 """x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
@@ -165,7 +165,7 @@ def payload_bps(base_bps: int, *, size: tuple[int, int], fps: float, edge_id: st
 
 def vbv_s(fps: float, *, tight: bool = False) -> float:
     """Depth of the VBV at this rate of coded frames."""
-    return max(_TIGHT_VBV_S if tight else VBV_S, _VBV_FRAMES / fps)
+    return max(_TIGHT_VBV_S, _TIGHT_VBV_FRAMES / fps) if tight else max(VBV_S, _VBV_FRAMES / fps)
 
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
