@@ -101,7 +101,7 @@ def still_cases() -> Iterator[dict[str, Any]]:
         yield {
             "what": what,
             "size": size,
-            "parameters": {"b": zlib.crc32(to_planar(base).tobytes()) ^ change},
+            "parameters": {"b": zlib.crc32(to_planar(base).tobytes()) & 0xFFFF ^ change},
             "crop_source_px": crop,
             "view_scale": scale,
             "view_offset_px": offset,

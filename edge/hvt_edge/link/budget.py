@@ -39,7 +39,7 @@ import numpy.typing as npt
 
 from hvt_common.units import SECOND_NS
 
-BASE_ATTACHMENT_BYTES = 48
+BASE_ATTACHMENT_BYTES = 44
 """The largest `BaseHeader`."""
 _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""

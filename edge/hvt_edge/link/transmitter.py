@@ -42,7 +42,7 @@ from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
 from hvt_edge.link.pacer import BaseInFlight, Pacer
 from hvt_edge.link.stills import Still
 
-STILL_ATTACHMENT_BYTES = 60
+STILL_ATTACHMENT_BYTES = 55
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
 `Transmitter.still_allowance_bytes` of one that is counts its own header."""
 BACKLOG_ATTACHMENT_BYTES = 48

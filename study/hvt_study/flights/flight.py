@@ -51,7 +51,7 @@ from hvt_study.flights.flight_link import (
 )
 from hvt_study.metrics.observed import ObservedFrame
 
-_SESSION = 1 << 40  # as many bytes on the wire as a random one
+_SESSION = 1 << 31  # as many bytes on the wire as a random one
 
 
 @dataclass(frozen=True, slots=True)

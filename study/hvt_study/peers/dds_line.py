@@ -16,9 +16,9 @@ from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import RollingBudget
 from hvt_study.flights.flight_link import Arrival, SerialLink
 
-HEADER_BYTES = 48
+HEADER_BYTES = 44
 """What a `BaseHeader` takes at most."""
-_SESSION = 1 << 40  # as many bytes on the wire as a random one
+_SESSION = 1 << 31  # as many bytes on the wire as a random one
 _CHANNELS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.CONTROL: Account.META}
 _KEYS = EdgeKeys("edge-1")
 _VIDEO = DELIVERIES[Channel.BASE].encoding

@@ -87,7 +87,7 @@ class Rig:
             self.out,
             ledger=self.ledger,
             budget=self.budget,
-            session_id=2**64 - 1,
+            session_id=2**32 - 1,
             lockstep=lockstep,
             wait_until=self.waits.append,
             pacer=pacer,
@@ -122,7 +122,7 @@ def send_status(rig, make, **how) -> bool:
 def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
     """A report with so many reasons."""
     counts = {f"{name}{number}": 4_000_000_000 for number in range(reasons)}
-    known = replace(STATUS, session_id=2**64 - 1, send_ns=at_ns, media_ns=max(0, at_ns - NOW_NS))
+    known = replace(STATUS, session_id=2**32 - 1, send_ns=at_ns, media_ns=max(0, at_ns - NOW_NS))
     return replace(known, sent=counts, deferred=counts, dropped=counts, failed=(), levers="")
 
 
@@ -196,7 +196,7 @@ def test_a_base_message_says_what_the_ground_needs():
     assert headers[1].flags == 0
     assert [one.capture_ns for one in headers] == [NOW_NS + 4, NOW_NS + 7]
     assert [one.send_ns for one in headers] == [NOW_NS + 100, NOW_NS + 200]
-    assert {one.session_id for one in headers} == {2**64 - 1}
+    assert {one.session_id for one in headers} == {2**32 - 1}
     assert [encoding for *_, encoding in rig.out.puts] == ["video/h265"] * 2
     assert rig.sender.base_sequence == 1
 

@@ -40,7 +40,8 @@ from hvt_common.video.still_codecs.yuv420 import (
 )
 
 CHECKSUM = "b"
-"""The parameter with the CRC-32 of the reference picture: the base crop's planes Y, Cb and Cr, whole blocks."""
+"""The parameter with the low 16 bits of the CRC-32 of the reference picture: the base crop's planes Y, Cb and Cr, whole
+blocks. Recordings may have all 32."""
 
 _REFERENCE_QP = 4
 """The base crop in x264: within 0.3 levels of the base itself."""
@@ -83,7 +84,8 @@ class ResidualCodec:
         if base_bgr is None or base_bgr.shape != (size[1], size[0], 3):
             raise BaseMissingError(f"a residual still of {size[0]}x{size[1]} has no base crop of that size")
         base = to_planar(base_bgr)
-        if parameters.get(CHECKSUM) != _checksum(base):
+        known = parameters.get(CHECKSUM)
+        if not isinstance(known, int) or known & 0xFFFF != _checksum(base):
             raise BaseMissingError("a residual still builds on another base picture than the one at hand")
         qp, cabac = split_payload(data)
         whole = padded_size(size)
@@ -94,4 +96,4 @@ class ResidualCodec:
 
 
 def _checksum(base: Planar) -> int:
-    return zlib.crc32(base.tobytes())
+    return zlib.crc32(base.tobytes()) & 0xFFFF
