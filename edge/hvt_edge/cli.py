@@ -75,7 +75,7 @@ def _run(argv: Sequence[str] | None) -> int:
         form=config.log_format,
         redaction=redaction,
         edge=config.edge_id,
-        session=f"{world.session_id:016x}",
+        session=f"{world.session_id:08x}",
     )
     if note := note_on_share(config, given=given.values):
         logging.getLogger(START_LOGGER).info("%s", note)

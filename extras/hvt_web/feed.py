@@ -40,7 +40,7 @@ class SessionFeed(SinkWriter[Event]):
         self._late_ns = self._requested_ns = 0
         session = {
             "edge": info.edge,
-            "session": f"{info.session_id:016x}",
+            "session": f"{info.session_id:08x}",
             "baseSize": info.base_size,
             "sourceSize": info.source_size,
             "viewScale": info.view_scale,

@@ -40,7 +40,7 @@ class Entry:
         return self.session_id, self.kind, self.number
 
     def __str__(self) -> str:
-        return f"{self.kind} {self.number} of session {self.session_id:016x}"
+        return f"{self.kind} {self.number} of session {self.session_id:08x}"
 
 
 def entry_of(values: tuple[Any, ...]) -> Entry:

@@ -310,7 +310,7 @@ class Heartbeat:
             version=__version__,
             schema_version=WIRE_VERSION,
             edge=config.edge_id,
-            session=f"{self.session_id:016x}",
+            session=f"{self.session_id:08x}",
             state=phase,
             lockstep=lockstep,
             duration_s=counts.duration_s(config.nominal_fps),

@@ -229,7 +229,7 @@ def summary(of: Heartbeat, *, unreached: str) -> dict[str, Any]:
     stills["per_minute"] = round(60 * stills["sent"] / duration_s, 2) if duration_s else 0.0
     return {
         "edge": config.edge_id,
-        "session": f"{of.session_id:016x}",
+        "session": f"{of.session_id:08x}",
         "method": now.method,
         "levers": now.levers.says,
         "preset": now.preset,

@@ -44,7 +44,7 @@ def refuse_duplicate_edge(settings: LinkSettings, keys: EdgeKeys) -> None:
     other = living_edge(settings, keys)
     if other is not None:
         raise UserError(
-            f"edge id {keys.edge!r} is in use: an edge of that id (session {other.session_id:016x}, version "
+            f"edge id {keys.edge!r} is in use: an edge of that id (session {other.session_id:08x}, version "
             f"{other.software:.32}) answers on this link; stop it, or give this one an --edge-id of its own"
         )
 

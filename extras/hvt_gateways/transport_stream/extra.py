@@ -64,7 +64,7 @@ class TransportStreamExtra(Extra[TransportStreamOptions]):
 
         def sinks(flight: Flight) -> Iterable[Opening]:
             info = flight.info
-            platform = Platform(info.edge, f"{info.session_id:016x}", info.view, flight.locator)
+            platform = Platform(info.edge, f"{info.session_id:08x}", info.view, flight.locator)
             if isinstance(where, Path):
                 opens = flight.new_file(where, ".ts", partial(stream_file, platform=platform, fps=info.fps))
             else:

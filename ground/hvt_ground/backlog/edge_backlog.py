@@ -89,7 +89,7 @@ class EdgeBacklog:
         """
         is_own = header.session_id == own.info.session_id
         if not is_own and (self._recordings is None or not self._recordings.takes(header.session_id)):
-            raise WireError(f"it was stored of the session {header.session_id:016x}, which is not shown")
+            raise WireError(f"it was stored of the session {header.session_id:08x}, which is not shown")
         is_info = header.kind == BacklogKind.INFO
         with self._lock:
             known = is_own or header.session_id in self._infos

@@ -202,7 +202,7 @@ class Receiver:
             return None
         self._other_said_ns = now_ns
         text = (
-            f"two edges call themselves {self._edge}: the session {shown:016x} is shown, {session_id:016x} is not; "
+            f"two edges call themselves {self._edge}: the session {shown:08x} is shown, {session_id:08x} is not; "
             "stop one of them, or start it with an --edge-id of its own"
         )
         _log.warning("%s", text)
@@ -224,7 +224,7 @@ class Receiver:
         if session_id == self._other:  # of which enough has been said
             self._damaged += 1
         else:
-            self.skip(row, WireError(f"it belongs to the session {session_id:016x}, which is not shown"))
+            self.skip(row, WireError(f"it belongs to the session {session_id:08x}, which is not shown"))
 
 
 def _parsed(row: Channel | None, item: Received, versions: Sequence[int]) -> _Message | None:

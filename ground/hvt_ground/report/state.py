@@ -112,7 +112,7 @@ def _failed_at_edge(at: _Moment) -> tuple[FailedPart, ...]:
 class SessionState:
     """The session of an edge that is open."""
 
-    session: str = _of(lambda at: f"{at.session.info.session_id:016x}")
+    session: str = _of(lambda at: f"{at.session.info.session_id:08x}")
     """Its id, hexadecimal."""
     software: str = _of(lambda at: at.session.info.software)
     """The edge's."""
@@ -314,7 +314,7 @@ class StateMaker:
         if sessions.receiver.silent_ns > LOST_NS and not session.lockstep:
             return "lost"
         left_out = _left_out(session.reception.last_status)
-        key = f"{session.info.session_id:016x}"
+        key = f"{session.info.session_id:08x}"
         known_key, known, rose_ns = self._left_out.get(edge, (key, left_out, 0))
         if known_key != key or left_out < known:
             known, rose_ns = left_out, 0

@@ -54,7 +54,7 @@ def summary(session: Session) -> dict[str, Any]:
     backlog = session.backlog.totals
     return {
         "edge": info.edge,
-        "session": f"{info.session_id:016x}",
+        "session": f"{info.session_id:08x}",
         "method": info.method,
         "pace": info.pace,
         "frames": reception.frames,

@@ -347,7 +347,7 @@ class EdgeSessions:
         shown = self.session
         if info is None and shown is not None and self._query_info(shown.info.session_id) is not None:
             self.receiver.stream.disown()
-            self.receiver.skip("base", WireError(f"the edge does not know of a session {session_id:016x}"))
+            self.receiver.skip("base", WireError(f"the edge does not know of a session {session_id:08x}"))
             return
         self._end_session()
         if info is None:
@@ -360,7 +360,7 @@ class EdgeSessions:
             return
         self.port.used.set()
         self._next_clock_ns = time.monotonic_ns() + _CLOCK_EVERY_NS
-        log_fields(session=f"{info.session_id:016x}")
+        log_fields(session=f"{info.session_id:08x}")
         self.session = self._open_session(info, self._reports)
         self.session.reception.counters = self.receiver.stream.counters
         self.failures.works(self._part)

@@ -177,7 +177,7 @@ class SessionTiming:
 
     def __init__(self, table: Sink[str], *, edge: str, session_id: int) -> None:
         self._table = table
-        self._whose = (edge, f"{session_id:016x}")
+        self._whose = (edge, f"{session_id:08x}")
         self._lock = threading.Lock()
         self._unread: dict[int, MessageTiming] = {}
 

@@ -284,7 +284,7 @@ class SessionFactory:
         return RecorderSettings(
             path=None,
             edge_id=info.edge,
-            session=f"{info.session_id:016x}",
+            session=f"{info.session_id:08x}",
             base_size=info.base_size,
             fps=info.fps,
             budget_bps=info.budget_bps,

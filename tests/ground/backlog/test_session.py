@@ -70,7 +70,7 @@ def settings(info: Info, path: Path, **changes) -> RecorderSettings:
     return RecorderSettings(
         path=path,
         edge_id=info.edge,
-        session=f"{info.session_id:016x}",
+        session=f"{info.session_id:08x}",
         base_size=info.base_size,
         fps=info.fps,
         budget_bps=info.budget_bps,
@@ -511,7 +511,7 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     assert len(recording.boxes(30)) == 1
     texts = [text for _, _, text in recording.events()]
     assert "1 still and 2 s of video of this session arrived after it had ended" in texts
-    assert f"uav-1-{sid:016x}".encode() in (tmp_path / "backlog-0.rrd").read_bytes(), (
+    assert f"uav-1-{sid:08x}".encode() in (tmp_path / "backlog-0.rrd").read_bytes(), (
         "the same recording to Rerun"
     )
     content = completed(summary(rig.ended[0]), rig.receiver)

@@ -61,7 +61,7 @@ class Consumer:
         settings = RecorderSettings(
             path=path,
             edge_id=info.edge,
-            session=f"{info.session_id:016x}",
+            session=f"{info.session_id:08x}",
             base_size=info.base_size,
             fps=info.fps,
             budget_bps=info.budget_bps,

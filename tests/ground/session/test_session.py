@@ -422,8 +422,8 @@ def test_a_second_edge_of_one_id_is_told_of_and_not_shown(flight, caplog):
         assert rig.port.keyframe_requests == 0
     said = [one.getMessage() for one in caplog.records if text in one.getMessage()]
     assert len(said) == 1
-    assert f"{flight.session_id:016x} is shown" in said[0]
-    assert f"{other.session_id:016x} is not" in said[0]
+    assert f"{flight.session_id:08x} is shown" in said[0]
+    assert f"{other.session_id:08x} is not" in said[0]
     assert "--edge-id" in said[0]
     assert len(caplog.records) <= 7, "a drone's whole flight would be in the log, message by message"
 
