@@ -44,7 +44,7 @@ _FRAME_FLOOR_BITS_PER_PX = 0.0045
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
 _VBV_FRAMES, _TIGHT_VBV_FRAMES = 1.3, 1.15
-"""At least: with 1.15 x265 uses .8 of its rate, with 1.3 it uses .9; with more, a window of few frames cannot hold them."""
+"""At least: with 1.15 x265 uses .8 of its rate, with 1.3 .9; with more, a window of few frames cannot hold them."""
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
 _KEYFRAME_EVERY_S = 5.0
 """x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.

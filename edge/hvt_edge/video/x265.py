@@ -219,9 +219,9 @@ _RATE_BY_DEPTH = 0.45
 """x265 spends .3 to .8 as a power of the depth: less from 60 kbps up in long flights, more in the first seconds."""
 _QP_TO_LAMBDA = 118
 _FEW_ROWS_PX, _SHALLOW_FRAMES = 192, 2.0
-"""The rate is held from row to row, and up to this height there are at most three of the usual blocks of 64. Where the
-VBV holds less than these frames, blocks of 32 use .86 to 1 of the rate for .6 to .95, and are .2 to 1.6 dB better. In a
-deeper one they are as good or .3 dB worse, and so they are in higher pictures."""
+"""The rate is held from row to row, and up to this height there are at most three of the usual blocks of 64. Where
+the VBV holds less than these frames, blocks of 32 use .86 to 1 of the rate for .6 to .95, and are .2 to 1.6 dB
+better. In a deeper one they are as good or .3 dB worse, and so they are in higher pictures."""
 _WITHOUT_AQ = ("ultrafast", "superfast")
 """Presets without adaptive quantisation, where x265 ignores regions: a trace of it makes them count."""
 

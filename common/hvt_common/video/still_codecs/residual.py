@@ -40,8 +40,8 @@ from hvt_common.video.still_codecs.yuv420 import (
 )
 
 CHECKSUM = "b"
-"""The parameter with the low 16 bits of the CRC-32 of the reference picture: the base crop's planes Y, Cb and Cr, whole
-blocks. Recordings may have all 32."""
+"""The parameter with the low 16 bits (recordings may have all) of the CRC-32 of the reference picture: the base crop's
+planes Y, Cb and Cr, whole blocks."""
 
 _REFERENCE_QP = 4
 """The base crop in x264: within 0.3 levels of the base itself."""
