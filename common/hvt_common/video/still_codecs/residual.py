@@ -40,7 +40,7 @@ from hvt_common.video.still_codecs.yuv420 import (
 )
 
 CHECKSUM = "b"
-"""The parameter with the low 16 bits (recordings may have all) of the CRC-32 of the reference picture: the base crop's
+"""The parameter with the low 16 bits (recordings may have all) of the CRC-32 of the reference: the base crop's
 planes Y, Cb and Cr, whole blocks."""
 
 _REFERENCE_QP = 4
