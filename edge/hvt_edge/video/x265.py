@@ -335,9 +335,9 @@ def _whole(settings: EncoderSettings) -> tuple[int, int]:
     # Rate and depth of the VBV as x265 takes them: kilobits a second, and kilobits. At these depths a deeper one uses
     # more of the rate, and from 7 to 8 kbit is 14 %: rounded alone, the bits spent would jump by 5 to 8 % there. So
     # depth is rounded up, and what that adds is taken off the rate.
-    asked_kbit = settings.bitrate_bps / 1000 * settings.vbv_s
-    depth_kbit = max(1, math.ceil(asked_kbit))
-    kbps = settings.bitrate_bps / 1000 * min(1.0, asked_kbit / depth_kbit) ** _RATE_BY_DEPTH
+    exact_kbit = settings.bitrate_bps / 1000 * settings.vbv_s
+    depth_kbit = max(1, math.ceil(exact_kbit))
+    kbps = settings.bitrate_bps / 1000 * min(1.0, exact_kbit / depth_kbit) ** _RATE_BY_DEPTH
     return max(1, int(kbps)), depth_kbit
 
 
