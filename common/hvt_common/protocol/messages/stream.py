@@ -30,8 +30,6 @@ from hvt_common.runtime.statistics import Newest
 MAX_ALSO = 15
 """How many further tracks one still may name."""
 
-_TIME = Int(0, I63)
-_DELAY = Int(-I63, I63)
 _FAR_PX = 32767
 _BOX = Box(Scaled(-_FAR_PX, _FAR_PX, 8))
 _CROP = Box(Int(0, _FAR_PX), empty=False)
@@ -55,31 +53,37 @@ class Flags(IntFlag):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BaseHeader(Message):
-    """Attachment of ``base``."""
-
-    MAX_BYTES: ClassVar[int] = 80
+class OfFrame(Message):
+    """The beginning of each message that belongs to a frame."""
 
     session_id: int = wire_field(Int(0, U64))
     """Random, new at each start of the edge."""
     sequence: int = wire_field(Int(0, U32))
-    """0, 1, 2 … for each message sent; a hole means that messages were lost."""
+    """0, 1, 2 … for each message of the channel; a hole means that messages were lost."""
     frame_index: int = wire_field(Int(0, U32))
     """Index of the frame at the source rate; a frame dropped before encoding leaves a hole here only."""
-    capture_ns: int = wire_field(_TIME)
+    capture_ns: int = wire_field(Int(0, I63))
     """Unix time at the source, nanoseconds of the edge's clock."""
-    send_delay_ns: int = wire_field(_DELAY)
+    send_delay_ns: int = wire_field(Int(-I63, I63))
     """Send time minus ``capture_ns``."""
+
+    @property
+    def send_ns(self) -> int:
+        """When the edge handed the message to Zenoh, its clock; media time in lockstep."""
+        return self.capture_ns + self.send_delay_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BaseHeader(OfFrame):
+    """Attachment of ``base``."""
+
+    MAX_BYTES: ClassVar[int] = 80
+
     flags: int = wire_field(Int(0, 255))
 
     @property
     def keyframe(self) -> bool:
         return bool(self.flags & Flags.KEYFRAME)
-
-    @property
-    def send_ns(self) -> int:
-        """When the edge handed the message to Zenoh, its clock."""
-        return self.capture_ns + self.send_delay_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,20 +106,26 @@ _PLACE = Int(-2 * _PER_PX * _FAR_PX, 2 * _PER_PX * _FAR_PX)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StillWire(Message):
-    """A `RoiHeader` as it is sent."""
+class OfStill(OfFrame):
+    """The beginning of a still's header, in each version."""
 
     MAX_BYTES: ClassVar[int] = 1024
     MAX_PAYLOAD: ClassVar[int] = 2**20
-    TRIMMED: ClassVar[bool] = True
+    """The largest still, 512x512 pixels, has 768 KiB before it is coded; a ground queues hundreds."""
 
-    session_id: int = wire_field(Int(0, U64))
-    sequence: int = wire_field(Int(0, U32))
-    frame_index: int = wire_field(Int(0, U32))
     capture_ns: int = wire_field(Int(-1, I63))
-    send_delay_ns: int = wire_field(_DELAY)
+    """-1: that of the access unit of this frame."""
     flags: int = wire_field(Int(0, 255))
     track_id: int = wire_field(Int(-1, U32))
+    """The edge's track; -1 where the still belongs to none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StillWire(OfStill):
+    """A `RoiHeader` as it is sent."""
+
+    TRIMMED: ClassVar[bool] = True
+
     place: tuple[int, ...] = wire_field(ListOf(_PLACE, 10))
     """Of the crop x, y, width and height; how far inside its sides those of the track's box are, left, top, right,
     bottom, in eighths; and, where it is not the crop's own, the coded size."""
@@ -182,26 +192,12 @@ _SAME = tuple(name for name, _ in kinds(StillWire) if name not in ("place", "bas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RoiHeader(Message):
+class RoiHeader(OfStill):
     """Attachment of ``roi``. Boxes are x1, y1, x2, y2 in source pixels, x2 and y2 exclusive.
 
     Its fields are those of version 4; `StillWire` is what is sent.
     """
 
-    MAX_BYTES: ClassVar[int] = 1024
-    MAX_PAYLOAD: ClassVar[int] = 2**20
-    """The largest still, 512x512 pixels, has 768 KiB before it is coded; a ground queues hundreds."""
-
-    session_id: int = wire_field(Int(0, U64))
-    sequence: int = wire_field(Int(0, U32))
-    """Of stills: 0, 1, 2 … apart from that of ``base``."""
-    frame_index: int = wire_field(Int(0, U32))
-    capture_ns: int = wire_field(Int(-1, I63))
-    """-1: that of the access unit of this frame."""
-    send_delay_ns: int = wire_field(_DELAY)
-    flags: int = wire_field(Int(0, 255))
-    track_id: int = wire_field(Int(-1, U32))
-    """The edge's track; -1 where the still belongs to none."""
     box_source_px: tuple[float, float, float, float] = wire_field(_BOX)
     """The track's box at that frame, in eighths of a pixel; may reach beyond the frame."""
     crop_source_px: tuple[int, int, int, int] = wire_field(_CROP)
@@ -237,11 +233,6 @@ class RoiHeader(Message):
         if index >= len(class_names):
             raise WireError(f"a still of class {index}, where {len(class_names)} are named")
         return replace(self, class_name=class_names[index])
-
-    @property
-    def send_ns(self) -> int:
-        """When the edge handed the message to Zenoh, its clock; media time in lockstep."""
-        return self.capture_ns + self.send_delay_ns
 
 
 class CaptureTimes:

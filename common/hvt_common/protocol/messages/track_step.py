@@ -17,8 +17,8 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from hvt_common.protocol.messages.envelope import Message
-from hvt_common.protocol.messages.fields import I63, U32, U64, Blob, Int, WireError, wire_field
+from hvt_common.protocol.messages.fields import U32, Blob, Int, WireError, wire_field
+from hvt_common.protocol.messages.stream import OfFrame
 from hvt_common.protocol.messages.track_boxes import (
     CONFIDENCE_STEPS,
     MOST_BOXES,
@@ -35,31 +35,18 @@ _EARLY: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackStep(Message):
+class TrackStep(OfFrame):
     """Payload of ``tracks``: what the edge's tracker listed at one frame. Boxes are in base pixels."""
 
     MAX_BYTES: ClassVar[int] = 16_384
     TRIMMED: ClassVar[bool] = True
 
-    session_id: int = wire_field(Int(0, U64))
-    sequence: int = wire_field(Int(0, U32))
-    """Counts track steps: 0, 1, 2 …; a hole means that messages were lost."""
-    frame_index: int = wire_field(Int(0, U32))
-    """The frame whose tracks these are."""
-    capture_ns: int = wire_field(Int(0, I63))
-    send_delay_ns: int = wire_field(Int(-I63, I63))
-    """Send time minus ``capture_ns``."""
     reference: int = wire_field(Int(-1, U32))
     """Sequence of the step that the boxes are coded against; -1 where they stand by themselves."""
     boxes: bytes = wire_field(Blob(_MOST_BOX_BYTES))
     """Range-coded; see docs/wire-tracks.md."""
     coding: int = wire_field(Int(1, 255), default=1)
     """How the boxes are coded: 1 is docs/wire-tracks.md."""
-
-    @property
-    def send_ns(self) -> int:
-        """When the edge handed the message to Zenoh, its clock; media time in lockstep."""
-        return self.capture_ns + self.send_delay_ns
 
 
 class TrackStepEncoder:
