@@ -268,6 +268,5 @@ class _Reader:
         return value
 
     def end(self) -> None:
-        """Refuse remaining arguments."""
         if self._left:
             raise RefusedError(f"{self._command} takes no {next(iter(self._left))!r:.24}")

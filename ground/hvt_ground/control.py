@@ -361,7 +361,6 @@ class EdgeClient:
         return f"no edge is there{_link_hint(self._session)}"
 
     def names(self) -> list[str]:
-        """The edges that are there now."""
         replies = self._session.liveliness().get(selector(Channel.ALIVE), timeout=ANSWER_S)
         keys = [parse_key(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None]
         return sorted({key[0] for key in keys if key is not None})
@@ -370,7 +369,6 @@ class EdgeClient:
         return RemoteEdge(self._session, edge, requester=self._requester)
 
     def close(self) -> None:
-        """Leave the link."""
         self._stack.close()
 
     def __enter__(self) -> Self:

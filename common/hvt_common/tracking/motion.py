@@ -40,7 +40,6 @@ class Pictures:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all pictures."""
         self._newest: int | None = None
         """The frame of the newest one."""
         self.camera_step: Affine | None = None
@@ -49,11 +48,9 @@ class Pictures:
             self._camera.reset()
 
     def shift(self) -> float:
-        """`CameraMotion.shift`."""
         return 0.0 if self._camera is None else self._camera.shift()
 
     def still(self) -> bool:
-        """`CameraMotion.still`."""
         return self._camera is not None and self._camera.still()
 
     def step(

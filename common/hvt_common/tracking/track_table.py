@@ -98,7 +98,6 @@ class TrackTable:
         return cls(kalman.initiate(np.zeros((4, 0))), np.zeros(0), numbers, scores)
 
     def copy(self) -> TrackTable:
-        """The same tracks, which change no more."""
         return TrackTable(self.states.copy(), self.heights.copy(), self.numbers.copy(), self.scores.copy())
 
     def take(self, rows: _Indices) -> TrackTable:

@@ -154,7 +154,6 @@ class Store:
 
     @property
     def span_ns(self) -> int:
-        """Length of the video that is stored."""
         return self._span_ns + (0 if self._open is None else self._open.span_ns)
 
     def enter(self) -> None:

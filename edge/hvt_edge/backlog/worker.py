@@ -99,7 +99,6 @@ class Intake:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing waits and nothing more comes."""
         with self._changed:
             return self._closed and not self._items
 

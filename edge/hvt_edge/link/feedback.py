@@ -150,7 +150,6 @@ class FeedbackInbox:
             self._results.append(result)
 
     def take(self) -> list[StillResult]:
-        """Return and forget all results so far."""
         with self._changed:
             results = list(self._results)
             self._results.clear()

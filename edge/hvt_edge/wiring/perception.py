@@ -211,12 +211,10 @@ def _hidden_pixels(view: View) -> float:
 
 
 def make_suppression(config: EdgeConfig) -> Suppression:
-    """Make the rule that says which tracks pause, and for how long."""
     return Suppression.for_cooldown(config.cooldown, min_gain=config.min_gain)
 
 
 def make_maker(config: EdgeConfig, *, readable: Callable[[str], bool]) -> StillMaker:
-    """Who crops and codes; for ``readable`` see there."""
     codec = still_codec(config.still_codec)
     return StillMaker(
         codec=codec,

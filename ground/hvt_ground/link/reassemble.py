@@ -120,7 +120,6 @@ class Repair:
         self.begin(0, 0)
 
     def begin(self, sequence: int, now_ns: int) -> None:
-        """The first unit of a session comes."""
         self.interval_ns = 0
         """About the time between two units."""
         self._newest = (sequence, now_ns)
@@ -131,7 +130,6 @@ class Repair:
         """Holes without one; the time until which none waits; for how long none will."""
 
     def came(self, sequence: int, now_ns: int) -> None:
-        """Another unit comes."""
         if (units := sequence - self._newest[0]) > 0:
             step_ns = min((now_ns - self._newest[1]) // units, 2 * _MOST_INTERVAL_NS)  # more is a pause
             self.interval_ns = (3 * self.interval_ns + step_ns) // 4
@@ -290,7 +288,6 @@ class Reassembler(Generic[T]):
         return self._unshown and now_ns - self._progress_ns >= SILENCE_NS
 
     def keyframe_requested(self, now_ns: int) -> None:
-        """Note that a request went out."""
         self.counters.keyframe_requests += 1
         self._requests_in_gap += 1
         if self._requests_in_gap == 1:

@@ -136,7 +136,6 @@ class Reception:
     # What the receiving thread brings
 
     def base(self, header: BaseHeader, item: Received) -> None:
-        """An access unit has its turn."""
         at_ns = item.received_ns  # its own, also where it waited behind a hole
         self._time_capture(header.capture_ns, at_ns)
         self.count(Channel.BASE, item, at_ns=header.send_ns)
@@ -234,7 +233,6 @@ class Reception:
         self.time(f"{Channel.BACKLOG}-{header.kind}", item, header, handled=delivered)
 
     def learn(self, info: Info) -> None:
-        """Take the session's present `Info`: budget and method may have changed."""
         if (info.budget_bps, info.method) != (self.budget_bps, self.method):
             budget = bitrate_text(info.budget_bps)
             self._note("info", f"from now on the budget is {budget}, and the method {info.method}")

@@ -298,7 +298,6 @@ class Pipeline:
         return self._inside(self._doubting(shown))
 
     def take_results(self) -> list[StillResult]:
-        """Return and forget the results of stills that the edge has not been sent yet."""
         return self._stills.take_results()
 
     def end(self) -> None:

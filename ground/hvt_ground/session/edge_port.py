@@ -136,7 +136,6 @@ class EdgePort:
         self._query(Channel.INFO, request.pack(), on_answer=note, on_end=on_end)
 
     def fail(self, error: Exception) -> None:
-        """Hand over the error of a callback."""
         self._errors.append(error)
 
     def raise_error(self) -> None:

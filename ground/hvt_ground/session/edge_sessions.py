@@ -129,7 +129,6 @@ class EdgeSessions:
 
     @property
     def finished(self) -> bool:
-        """Whether the thread has ended."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -147,7 +146,6 @@ class EdgeSessions:
 
     @property
     def idle(self) -> bool:
-        """Whether no session is open."""
         return self.session is None
 
     def work(self, item: Received | None, *, pending: bool) -> None:

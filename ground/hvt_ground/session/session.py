@@ -232,12 +232,10 @@ class Session:
 
     @property
     def stills_dropped(self) -> Counter[str]:
-        """Stills of which nothing was made, by reason."""
         return +(self.perceived.stills_dropped + self.worker.dropped)
 
     @property
     def idle(self) -> bool:
-        """Nothing waits to be analyzed."""
         return self.worker.idle
 
     def take_resumed(self) -> bool:

@@ -193,7 +193,6 @@ class QueuedSink(Generic[T]):
 
     @property
     def ended(self) -> bool:
-        """Whether nothing is done any more."""
         return not self._thread.is_alive()
 
     def _fits(self, size: int) -> bool:

@@ -38,7 +38,6 @@ class Passthrough:
 
 
 def unit_of(frame: Frame) -> AccessUnit:
-    """The camera's unit of this frame, as it is sent."""
     unit = frame.camera_unit
     assert unit is not None, "the source was opened for passthrough"
     return AccessUnit(frame.index, frame.capture_ns, unit.data, keyframe=unit.keyframe)

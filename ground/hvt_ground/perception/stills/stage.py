@@ -112,7 +112,6 @@ class StillStage:
             self._resolved(resolved, now)
 
     def take_results(self) -> list[StillResult]:
-        """Return and forget the results of stills that the edge has not been sent yet."""
         results, self._results = self._results, []
         return results
 

@@ -72,7 +72,6 @@ class LiveView:
 
     @property
     def pid(self) -> int:
-        """The viewer's process."""
         assert self._process is not None, "it waits for a port"
         return self._process.pid
 

@@ -221,7 +221,6 @@ class Recorder(SinkWriter[Event]):
         self._awaits_keyframe = True
 
     def close(self, hurry: threading.Event | None = None) -> None:
-        """Close the file, or the viewer's connection (`close_file`)."""
         self.close_file(self.file, hurry)
 
     def __enter__(self) -> Self:
