@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import wait
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +33,7 @@ from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
-__all__ = ["DecodedFrame", "NothingPerceived", "Pipeline", "PipelineParts", "ReceivedStill"]
+__all__ = ["DecodedFrame", "PerceptionCounts", "Pipeline", "PipelineParts", "ReceivedStill"]
 
 _FARTHEST_S = 5
 """A step further ahead of all that is known is not plausible: nothing that comes after it could be shown."""
@@ -95,16 +95,33 @@ class PipelineParts:
     """Of the detector, in this session's video; None where its scale is given."""
 
 
-class NothingPerceived:
-    """The counts of a `Pipeline` that is not made yet."""
+@dataclass(frozen=True, slots=True)
+class PerceptionCounts:
+    """The counts of a `Pipeline`; the defaults are those of one that is not made yet."""
 
-    tracks = refined = class_changes = stills_pending = detections_run = doubted = 0
+    tracks: int = 0
+    """Distinct tracks so far, whoever saw them."""
+    refined: int = 0
+    """Distinct tracks that a still has refined."""
+    class_changes: int = 0
+    """Stills after which the class that is shown was another."""
+    doubted: int = 0
+    """Of the tracks that are shown, those that stills doubt."""
+    detections_run: int = 0
+    steps_used: int = 0
+    """Reports of the edge's tracks that were taken in."""
+    history_bytes: int = 0
+    """Of the pictures that are remembered for stills."""
+    stills_pending: int = 0
+    """For their base frame."""
+    stills_dropped: Counter[str] = field(default_factory=Counter)
+    """Stills of which nothing could be made, by reason; ``base_missing`` were asked for again."""
+    outcomes: Counter[str] = field(default_factory=Counter)
+    """The outcome of each object in the others."""
     view_trust: float | None = None
-    view_unlike = False
-
-    def __init__(self) -> None:
-        self.outcomes: Counter[str] = Counter()
-        self.stills_dropped: Counter[str] = Counter()
+    """Mean confidence of what the detector shows; None where that tells nothing."""
+    view_unlike: bool = False
+    """It is so low that the detector does not know the view."""
 
 
 class Pipeline:
@@ -159,25 +176,13 @@ class Pipeline:
         self._own: Tracks | None = None
         self._listed_frame = -1
         self._track_ids = SequenceWindow()
-        self.detections_run = 0
+        self._detections_run = 0
         self.objects_detected = -1
         """Objects that the detector showed when it last looked; -1 before the first time."""
-        self.doubted = 0
-        """Of the tracks that are shown, those that stills doubt."""
+        self._doubted = 0
         self.trust = parts.trust
+        self._steps_used = 0
         self.tilt = parts.refiner.tilt
-        self.steps_used = 0
-        """Reports of the edge's tracks that were taken in."""
-
-    @property
-    def view_trust(self) -> float | None:
-        """Mean confidence of what the detector shows; None where that tells nothing."""
-        return self.trust.mean
-
-    @property
-    def view_unlike(self) -> bool:
-        """It is so low that the detector does not know the view."""
-        return self.trust.unlike
 
     @property
     def searching(self) -> bool:
@@ -185,39 +190,21 @@ class Pipeline:
         return self._detection is not None and not self._detection.found.done()
 
     @property
-    def tracks(self) -> int:
-        """Distinct tracks so far, whoever saw them."""
-        return self._track_ids.count
-
-    @property
-    def stills_pending(self) -> int:
-        """For their base frame."""
-        return self._stills.pending
-
-    @property
-    def history_bytes(self) -> int:
-        """Of the pictures that are remembered for stills."""
-        return self._history.size_bytes
-
-    @property
-    def refined(self) -> int:
-        """Distinct tracks that a still has refined."""
-        return self._parts.refiner.tracks_refined
-
-    @property
-    def class_changes(self) -> int:
-        """Stills after which the class that is shown was another."""
-        return self._parts.refiner.class_changes
-
-    @property
-    def stills_dropped(self) -> Counter[str]:
-        """Stills of which nothing could be made, by reason; ``base_missing`` were asked for again."""
-        return self._stills.dropped
-
-    @property
-    def outcomes(self) -> Counter[str]:
-        """The outcome of each object in the others."""
-        return self._stills.outcomes
+    def counts(self) -> PerceptionCounts:
+        return PerceptionCounts(
+            tracks=self._track_ids.count,
+            refined=self._parts.refiner.tracks_refined,
+            class_changes=self._parts.refiner.class_changes,
+            doubted=self._doubted,
+            detections_run=self._detections_run,
+            steps_used=self._steps_used,
+            history_bytes=self._history.size_bytes,
+            stills_pending=self._stills.pending,
+            stills_dropped=self._stills.dropped,
+            outcomes=self._stills.outcomes,
+            view_trust=self.trust.mean,
+            view_unlike=self.trust.unlike,
+        )
 
     def analyze(self, picture: DecodedFrame, *, hurry: bool, news: threading.Event | None = None) -> None:
         """Take the next frame; with ``hurry`` detection waits for a later one, but not for ever.
@@ -271,7 +258,7 @@ class Pipeline:
         own = self._own_at(frame_index)
         if not self._parts.fusion.take_step(step, own=own):
             return
-        self.steps_used += 1
+        self._steps_used += 1
         if frame_index > self._now.frame_index:
             at_ns = self._capture_ns(frame_index) if capture_ns is None else capture_ns
             self._now = Progress(frame_index, at_ns, self._now.picture_index)
@@ -363,7 +350,7 @@ class Pipeline:
     def _detect(self, image: Image) -> Detections:
         # In the detector's thread.
         parts = self._parts
-        self.detections_run += 1
+        self._detections_run += 1
         found = parts.detector.detect(image) or Detections.none()
         return found if parts.search is None else parts.search.take(found, image)
 
@@ -413,7 +400,7 @@ class Pipeline:
             shown = self._parts.refiner.shown(fused.tracks, capture_ns=capture_ns, origins=fused.origins)
             if self._parts.guesses is not None:
                 self._parts.guesses.update(fused.tracks, shown.base_classes, step, scores=fused.means)
-            self.doubted = int(shown.doubted.sum())
+            self._doubted = int(shown.doubted.sum())
             if self._detection is not None and capture_ns - self._due_ns > _LATE_NS:
                 looked_ns = self._due_ns
             self._emit(replace(self._inside(self._doubting(shown)), looked_ns=looked_ns))

@@ -47,10 +47,10 @@ def _edge_text(one: EdgeState) -> str:
 
 def summary(session: Session) -> dict[str, Any]:
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do."""
-    info, pipeline, reception = session.info, session.perceived, session.reception
+    info, perceived, reception = session.info, session.perceived, session.reception
     counters, account = reception.counters, reception.ledger.summary(reception.duration_s)
     status = session.reception.last_status
-    unread = pipeline.outcomes.get("unread", 0)
+    unread = perceived.outcomes.get("unread", 0)
     backlog = session.backlog.totals
     return {
         "edge": info.edge,
@@ -72,7 +72,7 @@ def summary(session: Session) -> dict[str, Any]:
             "reasons": {
                 "received": account.outcomes["received"],
                 "dropped": dict(session.stills_dropped),
-                "outcomes": dict(pipeline.outcomes),
+                "outcomes": dict(perceived.outcomes),
                 "not_sent": dict(session.reception.not_sent),
             },
             "mean_bytes": round(account.roi_bytes / reception.stills) if reception.stills else 0,
@@ -83,12 +83,12 @@ def summary(session: Session) -> dict[str, Any]:
             "frames_left_out": backlog.left_out,
             "video_s": round(backlog.video_s, 3),
         },
-        "tracks": pipeline.tracks,
-        "tracks_refined": pipeline.refined,
-        "class_changes": pipeline.class_changes,
-        "view_trust": None if pipeline.view_trust is None else round(pipeline.view_trust, 3),
-        "view_unlike": pipeline.view_unlike,
-        "detections_run": pipeline.detections_run,
+        "tracks": perceived.tracks,
+        "tracks_refined": perceived.refined,
+        "class_changes": perceived.class_changes,
+        "view_trust": None if perceived.view_trust is None else round(perceived.view_trust, 3),
+        "view_unlike": perceived.view_unlike,
+        "detections_run": perceived.detections_run,
         "gaps": counters.gaps,
         "lost": counters.lost,
         "resent": counters.resent,

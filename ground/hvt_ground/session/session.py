@@ -30,7 +30,7 @@ from hvt_ground.events import Event, Level, Notice, Overlay, PoseUpdate, Refinem
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.link.reception import Reception
 from hvt_ground.perception.models import NotOpenError
-from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
+from hvt_ground.perception.pipeline import DecodedFrame, PerceptionCounts, Pipeline, ReceivedStill
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.poses import NOWHERE, Locator, SessionPoses
@@ -145,7 +145,8 @@ class Session:
         if reference_ns is not None:
             reception.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
-        reception.measure(header, tracks=self.perceived.tracks, tracks_refined=self.perceived.refined)
+        perceived = self.perceived
+        reception.measure(header, tracks=perceived.tracks, tracks_refined=perceived.refined)
         return True
 
     def take(self, header: RoiHeader | TrackStep | PoseReport | Status, item: Received) -> None:
@@ -226,9 +227,8 @@ class Session:
         return self._pipeline
 
     @property
-    def perceived(self) -> Pipeline | NothingPerceived:
-        """The counts of perception, also before it is made."""
-        return self._pipeline or NothingPerceived()
+    def perceived(self) -> PerceptionCounts:
+        return PerceptionCounts() if self._pipeline is None else self._pipeline.counts
 
     @property
     def stills_dropped(self) -> Counter[str]:

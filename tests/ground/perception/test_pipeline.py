@@ -102,8 +102,8 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
         rig.pipeline.analyze(picture, hurry=False)
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == list(range(30))
-    assert rig.pipeline.detections_run == 10
-    assert rig.pipeline.tracks == 1
+    assert rig.pipeline.counts.detections_run == 10
+    assert rig.pipeline.counts.tracks == 1
     for one in overlays[6:]:
         assert one.track_ids.tolist() == [1]
         np.testing.assert_allclose(one.boxes_base_px[0], square_box(one.frame_index), atol=6)
@@ -119,7 +119,7 @@ def test_only_pictures_that_are_searched_are_converted(flight, monkeypatch):
     for unit in flight.units:
         picture = decoder.decode_yuv(unit.data)
         rig.pipeline.analyze(DecodedFrame(unit.frame_index, unit.capture_ns, None, picture), hurry=False)
-    assert len(converted) == rig.pipeline.detections_run == 6
+    assert len(converted) == rig.pipeline.counts.detections_run == 6
     assert [one.track_ids.tolist() for one in rig.of(Overlay)[6:]] == [[1]] * 24
 
 
@@ -206,7 +206,7 @@ def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures)
     go.set()
     eventually(lambda: not rig.pipeline.searching, what="it is searched")
     np.testing.assert_array_equal(seen, [as_bgr(pictures[index].picture) for index in (0, 8)])
-    assert rig.pipeline.detections_run == 2
+    assert rig.pipeline.counts.detections_run == 2
 
 
 def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(pictures):
@@ -216,7 +216,9 @@ def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(picture
     class BlindAtLast(RedSquares):
         def detect(self, image_bgr):
             assert release.acquire(timeout=60)
-            return super().detect(image_bgr if rig.pipeline.detections_run == 1 else np.zeros_like(image_bgr))
+            return super().detect(
+                image_bgr if rig.pipeline.counts.detections_run == 1 else np.zeros_like(image_bgr)
+            )
 
     rig = Rig(detect_every=5, detector=BlindAtLast(), detector_thread=DetectorThread())
     rig.pipeline.analyze(pictures[0], hurry=False)
@@ -264,7 +266,7 @@ def test_while_the_detector_hangs_all_else_goes_on(flight, pictures, hangs_at):
     assert worker.close()
     rig.pipeline.end()
     assert [one.still_sequence for one in rig.of(Refinement)] == [0]
-    assert rig.pipeline.detections_run == hangs_at // 5 + 1
+    assert rig.pipeline.counts.detections_run == hangs_at // 5 + 1
     release.set()
 
 
@@ -278,7 +280,7 @@ def test_a_picture_that_was_never_searched_is_not_counted(pictures):
     rig.pipeline.end()
     go.set()
     thread.submit(pictures[0].picture, lambda _: Detections.none()).found.result(timeout=20)
-    assert rig.pipeline.detections_run == 0
+    assert rig.pipeline.counts.detections_run == 0
 
 
 def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):
@@ -288,7 +290,7 @@ def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):
     rig = Rig(detect_every=3, search=search, detector=NothingSeen())
     for picture in pictures:
         rig.pipeline.analyze(picture, hurry=False)
-    assert rig.pipeline.detections_run == 6, "frames 0, 9 and 18, and in vain: then every third again"
+    assert rig.pipeline.counts.detections_run == 6, "frames 0, 9 and 18, and in vain: then every third again"
     np.testing.assert_allclose(rig.of(Overlay)[0].boxes_base_px[0], square_box(0), atol=6)
 
 
@@ -352,7 +354,7 @@ def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flig
     assert overlays[12].doubted.all()
     assert overlays[19].refined.all()
     assert not overlays[19].doubted.any()
-    assert rig.pipeline.doubted == 0
+    assert rig.pipeline.counts.doubted == 0
     assert taken == [1] * 20, "it is told by what is found"
 
 
@@ -385,7 +387,7 @@ def test_in_a_hurry_detection_waits_but_the_track_goes_on(pictures):
     rig = Rig()
     for picture in pictures:
         rig.pipeline.analyze(picture, hurry=picture.frame_index % 4 != 0)
-    assert rig.pipeline.detections_run == 8
+    assert rig.pipeline.counts.detections_run == 8
     assert all(len(one.track_ids) == 1 for one in rig.of(Overlay)[8:])
 
 
@@ -394,7 +396,7 @@ def test_a_standing_picture_is_searched_less_often(pictures):
     rig = Rig(detect_every=2, detect_still_every=10)
     for index in range(30):
         rig.pipeline.analyze(replace(pictures[0], frame_index=index), hurry=False)
-    assert rig.pipeline.detections_run == 3
+    assert rig.pipeline.counts.detections_run == 3
     assert all(len(one.track_ids) == 1 for one in rig.of(Overlay))
 
 
@@ -412,7 +414,7 @@ def test_where_another_scene_begins_no_box_of_the_last_one_stays_and_the_new_one
         if index in (2, 5):  # a step of the scene before comes late
             rig.pipeline.edge_step(tracks_at(2 if index == 2 else 3, {32: (220.0, 20.0, 250.0, 50.0)}))
     assert [one.track_ids.tolist() for one in rig.of(Overlay)] == [[1]] * 3 + [[1, 2]] + [[]] + [[3]] * 5
-    assert rig.pipeline.detections_run == 2, "at 0 and at 5"
+    assert rig.pipeline.counts.detections_run == 2, "at 0 and at 5"
 
 
 def test_on_a_machine_that_is_always_behind_something_is_detected_now_and_then(pictures):
@@ -420,7 +422,7 @@ def test_on_a_machine_that_is_always_behind_something_is_detected_now_and_then(p
     rig = Rig(detect_every=2)
     for picture in pictures:
         rig.pipeline.analyze(picture, hurry=True)
-    assert rig.pipeline.detections_run == 4, "at 0, 8, 16 and 24"
+    assert rig.pipeline.counts.detections_run == 4, "at 0, 8, 16 and 24"
 
 
 def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
@@ -437,7 +439,11 @@ def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
     assert refinement.base_crop_bgr[16, 16, 2] > 150, "the base crop shows the square of frame 8"
     last = rig.of(Overlay)[-1]
     assert (last.base_classes, last.classes, last.refined.tolist()) == (("car",), ("bus",), [True])
-    assert (rig.pipeline.refined, rig.pipeline.class_changes, dict(rig.pipeline.outcomes)) == (
+    assert (
+        rig.pipeline.counts.refined,
+        rig.pipeline.counts.class_changes,
+        dict(rig.pipeline.counts.outcomes),
+    ) == (
         1,
         1,
         {"matched": 1},
@@ -462,7 +468,7 @@ def test_the_edge_hears_of_every_still_once(flight, pictures):
     (track_id,) = rig.of(Overlay)[-1].track_ids.tolist()
     assert {one.still_sequence: one.ground_track_id for one in results} == {0: track_id, 1: -1, 2: track_id}
     assert rig.pipeline.take_results() == []
-    assert dict(rig.pipeline.stills_dropped) == {"undecodable": 1}
+    assert dict(rig.pipeline.counts.stills_dropped) == {"undecodable": 1}
     assert [one.level for one in rig.of(Notice)] == ["warning"]
 
 
@@ -479,7 +485,7 @@ def test_a_still_that_lies_about_itself_is_dropped(flight, pictures, changes):
     rig = Rig()
     rig.pipeline.analyze(pictures[0], hurry=False)
     rig.pipeline.read([received(flight, 0, 0, **changes)])
-    assert dict(rig.pipeline.stills_dropped) == {"undecodable": 1}
+    assert dict(rig.pipeline.counts.stills_dropped) == {"undecodable": 1}
 
 
 def test_a_name_of_any_language_and_length_goes_back_to_the_edge(flight, pictures):
@@ -502,7 +508,7 @@ def test_a_still_that_nobody_can_read_is_shown_all_the_same(flight, pictures):
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_before, refinement.class_after) == (None, "car", "car")
     assert refinement.still[:2] == b"\xff\xd8"
-    assert (rig.pipeline.refined, dict(rig.pipeline.outcomes)) == (0, {"unread": 1})
+    assert (rig.pipeline.counts.refined, dict(rig.pipeline.counts.outcomes)) == (0, {"unread": 1})
 
 
 def test_what_still_waits_at_the_end_is_given_out(flight, pictures):
@@ -515,7 +521,7 @@ def test_what_still_waits_at_the_end_is_given_out(flight, pictures):
     rig.pipeline.end()
     (refinement,) = rig.of(Refinement)
     assert refinement.track_id is None
-    assert sum(rig.pipeline.outcomes.values()) == 1
+    assert sum(rig.pipeline.counts.outcomes.values()) == 1
 
 
 def test_a_picture_without_objects_is_an_empty_overlay(flight):
@@ -525,7 +531,7 @@ def test_a_picture_without_objects_is_an_empty_overlay(flight):
     rig.pipeline.analyze(DecodedFrame(0, 0, 0, grey), hurry=False)
     (overlay,) = rig.of(Overlay)
     assert overlay.boxes_base_px.shape == (0, 4)
-    assert (overlay.classes, rig.pipeline.tracks) == ((), 0)
+    assert (overlay.classes, rig.pipeline.counts.tracks) == ((), 0)
     assert flight.info().class_names == CLASSES
 
 
@@ -578,7 +584,7 @@ def test_a_residual_whose_frame_is_not_at_hand_is_asked_for_again_once(flight, p
         (4, 1, "", True),
         (5, 1, "", True),
     ]
-    assert dict(rig.pipeline.stills_dropped) == {"base_missing": 2}
+    assert dict(rig.pipeline.counts.stills_dropped) == {"base_missing": 2}
     assert [one.text.partition(":")[0] for one in rig.of(Notice)] == [
         "still 4 is asked for again",
         "still 5 is asked for again",
@@ -644,7 +650,7 @@ def test_each_object_in_a_still_gets_its_own_answer(flight, pictures):
     shown = rig.of(Refinement)
     assert [(one.edge_track_id, one.track_id, one.still_sequence) for one in shown] == [(1, 1, 3), (7, 2, 3)]
     assert shown[1].box_base_px == (200.0, 20.0, 240.0, 60.0)
-    assert rig.pipeline.refined == 2
+    assert rig.pipeline.counts.refined == 2
     rig.pipeline.read([received(flight, 8, 4, also=also, data=b"broken")])
     assert [(one.track_id, one.class_name) for one in rig.pipeline.take_results()] == [(1, ""), (7, "")]
 
@@ -684,8 +690,8 @@ def test_the_edges_tracks_and_ours_are_one_list(pictures):
     assert overlays[7].track_ids.tolist() == [1, 2]
     np.testing.assert_allclose(overlays[7].boxes_base_px[1], far, atol=0.1)
     np.testing.assert_allclose(overlays[7].boxes_base_px[0], square_box(7), atol=8)
-    assert rig.pipeline.tracks == 2
-    assert rig.pipeline.steps_used == 1
+    assert rig.pipeline.counts.tracks == 2
+    assert rig.pipeline.counts.steps_used == 1
 
 
 def test_what_has_left_the_picture_is_listed_no_more(pictures):

@@ -115,7 +115,7 @@ def test_a_still_is_shown_though_nobody_can_name_it(tmp_path: Path, classifier: 
     pipeline.read([ReceivedStill(header, item.payload)])
     (shown,) = [one for one in events if isinstance(one, Refinement)]
     assert shown.still == item.payload
-    assert pipeline.outcomes == {"unread": 1}
+    assert pipeline.counts.outcomes == {"unread": 1}
     assert [one.part for one in models.failures.parts] == [
         "classifier" if classifier == "file" else "detector"
     ]
@@ -146,10 +146,10 @@ def test_pictures_are_let_go_of():
     for unit in flight.units:
         image = decoder.decode(unit.data)
         pipeline.analyze(DecodedFrame(unit.frame_index, unit.capture_ns, unit.capture_ns, image), hurry=False)
-    assert pipeline.history_bytes > 0
+    assert pipeline.counts.history_bytes > 0
     pipeline.end()
-    assert pipeline.history_bytes == 0
-    assert pipeline.tracks == 1
+    assert pipeline.counts.history_bytes == 0
+    assert pipeline.counts.tracks == 1
 
 
 def test_all_sessions_take_turns_with_the_same_models():
