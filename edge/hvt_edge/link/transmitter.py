@@ -135,9 +135,7 @@ class Transmitter:
             self.in_flight.sent(self.base_sequence, unit, now_ns=at_ns)
         self.base_waited_ns += max(0, at_ns - now_ns)
         self.wait_until(at_ns)
-        self.outlet.put(
-            Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
-        )
+        self._put(Channel.BASE, unit.data, attachment)
         return line_bytes
 
     def _base_header(
@@ -179,9 +177,7 @@ class Transmitter:
                     self.pacer.sent_other(line_bytes, now_ns=at_ns)
                 self.in_flight.resent(sequence, now_ns=at_ns)
             self.wait_until(at_ns)
-            self.outlet.put(
-                Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
-            )
+            self._put(Channel.BASE, unit.data, attachment)
 
     def still_allowance_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
         """Payload that a still with the header of this one may take now, whatever data it holds itself.
@@ -310,9 +306,7 @@ class Transmitter:
             self.budget.record_other(line_bytes, now_ns)
             if self.pacer is not None:
                 self.pacer.sent_other(line_bytes, now_ns=now_ns)
-        self.outlet.put(
-            Channel.BACKLOG, chunk.data, attachment=attachment, encoding=DELIVERIES[Channel.BACKLOG].encoding
-        )
+        self._put(Channel.BACKLOG, chunk.data, attachment)
         return line_bytes
 
     def metadata(
@@ -349,7 +343,7 @@ class Transmitter:
             if self.pacer is not None:
                 self.pacer.sent_other(line_bytes, now_ns=at_ns)
         self.wait_until(at_ns)
-        self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
+        self._put(channel, payload, None)
         return True
 
     def reply(self, channel: Channel, payload: bytes) -> bytes:
@@ -452,6 +446,9 @@ class Transmitter:
             again=again,
         )
         return line_bytes
+
+    def _put(self, channel: Channel, payload: bytes, attachment: bytes | None) -> None:
+        self.outlet.put(channel, payload, attachment=attachment, encoding=DELIVERIES[channel].encoding)
 
     def _line_bytes(
         self, channel: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = ""
