@@ -23,6 +23,7 @@ import sqlite3
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -103,6 +104,7 @@ _PARTS = "SELECT frame_index, capture_ns, keyframe, data, crc FROM part WHERE ob
 _ENTRY = "SELECT id, session, kind, number, rank, span_ns FROM here"
 
 
+@dataclass(eq=False)
 class Store:
     """The objects of this session and of those before it, in bounded space. For one thread; any may read the counts.
 
@@ -113,27 +115,19 @@ class Store:
     Every method raises `OSError` where the disk refuses, and can be called again.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        max_bytes: int,
-        session_id: int,
-        info: Callable[[], bytes],
-        oldest_ns: int = 0,
-        clock: Callable[[], int] = time.time_ns,
-        since_boot: Callable[[], tuple[str, int]] = lambda: (boot_id(), since_boot_ns()),
-    ) -> None:
-        self.path = path
-        self._file = path / FILE_NAME
-        self.max_bytes = max_bytes
-        self._file_bytes = max_bytes - _LOG_BYTES
-        self._session = f"{session_id:016x}"
-        self._session_id = session_id
-        self._info = info
-        self._oldest_ns = oldest_ns
-        self._clock = clock
-        self._since_boot = since_boot
+    path: Path
+    _: KW_ONLY
+    max_bytes: int
+    session_id: int
+    info: Callable[[], bytes]
+    oldest_ns: int = 0
+    clock: Callable[[], int] = time.time_ns
+    since_boot: Callable[[], tuple[str, int]] = lambda: (boot_id(), since_boot_ns())
+
+    def __post_init__(self) -> None:
+        self._file = self.path / FILE_NAME
+        self._file_bytes = self.max_bytes - _LOG_BYTES
+        self._session = f"{self.session_id:016x}"
         self._db: sqlite3.Connection | None = None
         self._open: OpenSegment | None = None
         self._still_bytes = self._span_ns = 0
@@ -178,7 +172,7 @@ class Store:
         """Store a still; ``data`` is `pack_backlog_still`'s."""
         with self._disk():
             db = self._writable()
-            if self.find((self._session_id, BacklogKind.STILL, number)) is not None:
+            if self.find((self.session_id, BacklogKind.STILL, number)) is not None:
                 return
             self._evict_for(len(data), db)
             self._add(BacklogKind.STILL, number, capture_ns, worth(utility, capture_ns), data)
@@ -218,7 +212,7 @@ class Store:
             row = self._db.execute(insert, values).lastrowid
             if kind is not BacklogKind.INFO:
                 self._db.execute("DELETE FROM stored")
-                self._db.execute("INSERT INTO stored VALUES (?, ?, ?)", (capture_ns, *self._since_boot()))
+                self._db.execute("INSERT INTO stored VALUES (?, ?, ?)", (capture_ns, *self.since_boot()))
             if data:
                 crc = zlib.crc32(data)
                 self._db.execute("INSERT INTO part (object, crc, data) VALUES (?, ?, ?)", (row, crc, data))
@@ -359,8 +353,8 @@ class Store:
             self._lose()
             raise FileNotFoundError(errno.ENOENT, _REMOVED, str(self._file))
         db = self._ready()
-        if self.info_of(self._session_id) is None:
-            self._add(BacklogKind.INFO, 0, 0, 0.0, self._info())
+        if self.info_of(self.session_id) is None:
+            self._add(BacklogKind.INFO, 0, 0, 0.0, self.info())
         return db
 
     def _opened(self) -> sqlite3.Connection:
@@ -383,7 +377,7 @@ class Store:
         with contextlib.suppress(sqlite3.OperationalError):
             db.executescript(_ADOPT)
             self._move_times(db)
-            dropped = db.execute(_TOO_OLD, (self._oldest_ns,)).fetchall()
+            dropped = db.execute(_TOO_OLD, (self.oldest_ns,)).fetchall()
             db.executemany("DELETE FROM object WHERE id = ?", [row[:1] for row in dropped])
             if dropped:
                 named = ", ".join(
@@ -407,9 +401,9 @@ class Store:
             if newest_ns is None:
                 return
             found = newest_ns, "", 0
-        now_ns = self._clock()
-        most_ns = round(max(0, now_ns - self._oldest_ns) * _TRUSTED_SHARE)
-        moved_ns = unwitnessed_ns(Moment(*found), Moment(now_ns, *self._since_boot()), most_ns=most_ns)
+        now_ns = self.clock()
+        most_ns = round(max(0, now_ns - self.oldest_ns) * _TRUSTED_SHARE)
+        moved_ns = unwitnessed_ns(Moment(*found), Moment(now_ns, *self.since_boot()), most_ns=most_ns)
         if abs(moved_ns) > _SET_NS:
             with db:
                 db.execute("BEGIN")

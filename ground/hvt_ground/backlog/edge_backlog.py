@@ -16,6 +16,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -182,6 +183,7 @@ class BacklogRecording:
         self.sink.log(event)
 
 
+@dataclass(eq=False)
 class BacklogRecordings:
     """Of one edge: opened when something comes of a session. Safe for threads.
 
@@ -191,21 +193,15 @@ class BacklogRecordings:
     file, and for as long nobody else does. ``clock`` is seconds without steps.
     """
 
-    def __init__(
-        self,
-        open_one: Callable[[Info], BacklogRecording],
-        *,
-        most: int = MOST_OPEN,
-        most_files: int = MOST_FILES,
-        open_s: float = _OPEN_S,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._open_one = open_one
-        self._most = most
-        self._open_s = open_s
-        self._most_files = most_files
-        self._clock = clock
-        self._made_s: deque[float] = deque(maxlen=most_files)
+    open_one: Callable[[Info], BacklogRecording]
+    _: KW_ONLY
+    most: int = MOST_OPEN
+    most_files: int = MOST_FILES
+    open_s: float = _OPEN_S
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        self._made_s: deque[float] = deque(maxlen=self.most_files)
         self._lock = threading.Lock()
         self._open: OrderedDict[int, BacklogRecording] = OrderedDict()
         self._closed = False
@@ -250,10 +246,10 @@ class BacklogRecordings:
                 if self._closed or not self._may_make():
                     return None, wait_s
                 self._close_surplus()
-                self._made_s.append(self._clock())
-                recording = self._open[info.session_id] = self._open_one(info)
+                self._made_s.append(self.clock())
+                recording = self._open[info.session_id] = self.open_one(info)
                 self._sinks.append(recording.sink)
-                wait_s = self._open_s
+                wait_s = self.open_s
             self._open.move_to_end(info.session_id)
             recording.users += 1
             return recording, wait_s
@@ -265,9 +261,9 @@ class BacklogRecordings:
                 self._open.popitem()[1].close()
 
     def _may_make(self) -> bool:
-        return len(self._made_s) < self._most_files or self._clock() - self._made_s[0] >= _DAY_S
+        return len(self._made_s) < self.most_files or self.clock() - self._made_s[0] >= _DAY_S
 
     def _close_surplus(self) -> None:
         unused = [session_id for session_id, recording in self._open.items() if not recording.users]
-        for session_id in unused[: max(0, len(self._open) + 1 - self._most)]:
+        for session_id in unused[: max(0, len(self._open) + 1 - self.most)]:
             self._open.pop(session_id).close()

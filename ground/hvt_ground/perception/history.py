@@ -10,7 +10,7 @@ to exactly the pixels that the edge had.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from hvt_common.video.hevc import YuvPicture
 DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 
 
+@dataclass(eq=False)
 class History:
     """Two bounded rings of one session, of pictures and of tracks; both grow by rising frame index only.
 
@@ -28,20 +29,14 @@ class History:
     leaves out, tracks are still interpolated.
     """
 
-    def __init__(
-        self,
-        *,
-        max_frames: int = 45,
-        max_bytes: int = DEFAULT_MAX_BYTES,
-        reach_frames: int = 300,
-        track_frames: int = 300,
-        gap_frames: int = 0,
-    ) -> None:
-        self._max_frames = max_frames
-        self._max_bytes = max_bytes
-        self._reach_frames = reach_frames
-        self._track_frames = track_frames
-        self._gap_frames = gap_frames
+    _: KW_ONLY
+    max_frames: int = 45
+    max_bytes: int = DEFAULT_MAX_BYTES
+    reach_frames: int = 300
+    track_frames: int = 300
+    gap_frames: int = 0
+
+    def __post_init__(self) -> None:
         self._frames: OrderedDict[int, Image | YuvPicture] = OrderedDict()
         self._frame_bytes = 0
         self._tracks: OrderedDict[int, Tracks] = OrderedDict()
@@ -66,7 +61,7 @@ class History:
         _require_rising(next(reversed(self._frames), None), frame_index)
         self._frames[frame_index] = picture
         self._frame_bytes += picture.nbytes
-        oldest = frame_index - self._reach_frames
+        oldest = frame_index - self.reach_frames
         while len(self._frames) > 1 and (self._frames_too_large() or next(iter(self._frames)) < oldest):
             _, dropped = self._frames.popitem(last=False)
             self._frame_bytes -= dropped.nbytes
@@ -75,7 +70,7 @@ class History:
         """Keep the tracks of a frame; an empty `Tracks` says that the frame was analyzed and held nothing."""
         _require_rising(self.newest_tracked, tracks.frame_index)
         self._tracks[tracks.frame_index] = tracks
-        if len(self._tracks) > self._track_frames:
+        if len(self._tracks) > self.track_frames:
             self._tracks.popitem(last=False)
 
     def revise_tracks(self, tracks: Tracks) -> None:
@@ -87,7 +82,7 @@ class History:
         elif tracks.frame_index > self.oldest_tracked:
             self._tracks[tracks.frame_index] = tracks
             self._tracks = OrderedDict(sorted(self._tracks.items()))
-            if len(self._tracks) > self._track_frames:
+            if len(self._tracks) > self.track_frames:
                 self._tracks.popitem(last=False)
 
     def picture(self, frame_index: int) -> Image | YuvPicture | None:
@@ -113,7 +108,7 @@ class History:
             return exact
         before = next((one for one in reversed(self._tracks) if one < frame_index), None)
         after = next((one for one in self._tracks if one > frame_index), None)
-        if before is None or after is None or after - before > self._gap_frames:
+        if before is None or after is None or after - before > self.gap_frames:
             return None
         share = (frame_index - before) / (after - before)
         return _between(self._tracks[before], self._tracks[after], frame_index, share=share)
@@ -132,7 +127,7 @@ class History:
         self._frame_bytes = 0
 
     def _frames_too_large(self) -> bool:
-        return len(self._frames) > self._max_frames or self._frame_bytes > self._max_bytes
+        return len(self._frames) > self.max_frames or self._frame_bytes > self.max_bytes
 
 
 def as_bgr(picture: Image | YuvPicture) -> Image:

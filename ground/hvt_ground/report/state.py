@@ -7,7 +7,7 @@ that none of them says what another does not. What is not known is None, never 0
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import KW_ONLY, asdict, dataclass, field, fields
 from typing import Any, Literal
 
 from hvt_common import __version__
@@ -243,31 +243,26 @@ class GroundState:
         return found
 
 
+@dataclass(eq=False)
 class StateMaker:
     """Makes states, and remembers since when each link is as it is. ``clock`` is Unix time without steps."""
 
-    def __init__(
-        self,
-        clock: Callable[[], int],
-        *,
-        detector: str = "",
-        classifier: str = "",
-        calibrated: bool = False,
-        failures: Failures | None = None,
-        loading: Callable[[], bool] = lambda: False,
-        group: GroundGroup | None = None,
-    ) -> None:
-        self._clock = clock
-        self._group = group
-        self._detector, self._classifier, self._calibrated = detector, classifier, calibrated
-        self._failures = failures
-        self._loading = loading
+    clock: Callable[[], int]
+    _: KW_ONLY
+    detector: str = ""
+    classifier: str = ""
+    calibrated: bool = False
+    failures: Failures | None = None
+    loading: Callable[[], bool] = lambda: False
+    group: GroundGroup | None = None
+
+    def __post_init__(self) -> None:
         self._links: dict[str, tuple[LinkState, int]] = {}
         self._left_out: dict[str, tuple[str, int, int]] = {}
         """By edge: session, frames that the link did not carry, and when that last rose."""
 
     def make(self, edges: Iterable[tuple[str, EdgeSessions]]) -> GroundState:
-        now_ns = self._clock()
+        now_ns = self.clock()
         made = tuple(self._edge(edge, sessions, now_ns) for edge, sessions in edges)
         known = {one.edge for one in made}
         for memory in (self._links, self._left_out):
@@ -277,14 +272,14 @@ class StateMaker:
             at_ns=now_ns,
             version=__version__,
             schema_version=WIRE_VERSION,
-            detector=self._detector,
-            classifier=self._classifier,
-            loading=self._loading(),
-            calibrated=self._calibrated,
+            detector=self.detector,
+            classifier=self.classifier,
+            loading=self.loading(),
+            calibrated=self.calibrated,
             edges=made,
-            member=None if self._group is None else self._group.member,
-            elsewhere={} if self._group is None else self._group.elsewhere,
-            failed=() if self._failures is None else self._failures.now,
+            member=None if self.group is None else self.group.member,
+            elsewhere={} if self.group is None else self.group.elsewhere,
+            failed=() if self.failures is None else self.failures.now,
         )
 
     def _edge(self, edge: str, sessions: EdgeSessions, now_ns: int) -> EdgeState:

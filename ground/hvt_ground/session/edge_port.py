@@ -8,6 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 
 import zenoh
 
@@ -47,6 +48,7 @@ InfoAnswer = tuple[Info, int, int]
 """A session's facts with the times of asking and hearing, ns."""
 
 
+@dataclass(eq=False)
 class EdgePort:
     """One edge as the link knows it: its messages in order of arrival, its presence, and a way to talk to it.
 
@@ -54,20 +56,15 @@ class EdgePort:
     callbacks by `raise_error`.
     """
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        edge: str,
-        *,
-        clock: Callable[[], int],
-        log: Callable[[Received], None] | None = None,
-        still_codecs: tuple[str, ...] = (),
-    ) -> None:
-        self.edge = edge
-        self._still_codecs = still_codecs
+    session: zenoh.Session
+    edge: str
+    _: KW_ONLY
+    clock: Callable[[], int]
+    log: Callable[[Received], None] | None = None
+    still_codecs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
         self._requester_id = secrets.randbits(64)
-        self._clock = clock
-        self._log = log
         self.inbox = Inbox(capacity=_INBOX_MESSAGES, share=_INBOX_SHARE)
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self._reports = TokenBucket(burst=_MOST_REPORTS_PER_S, every_ns=SECOND_NS // _MOST_REPORTS_PER_S)
@@ -79,8 +76,7 @@ class EdgePort:
         """When its newest message came; 0 before the first."""
         self._unanswered = self._unusable = 0
         self._version_said = False
-        self._session = session
-        self._keys = EdgeKeys(edge)
+        self._keys = EdgeKeys(self.edge)
         self._feedback: zenoh.Publisher | None = None
         self._sending = threading.Lock()
         """Zenoh raises where a publisher is undeclared while another thread puts into it."""
@@ -105,12 +101,12 @@ class EdgePort:
         return self._answers.popleft() if self._answers else None
 
     def _query_info(self, session_id: int, found: deque[InfoAnswer], *, on_end: Callable[[], None]) -> None:
-        requested_ns = self._clock()
+        requested_ns = self.clock()
 
         def note(data: bytes) -> None:
-            answered_ns = self._clock()
-            if self._log is not None:
-                self._log(Received(self._keys.key(Channel.INFO), data, b"", "", answered_ns))
+            answered_ns = self.clock()
+            if self.log is not None:
+                self.log(Received(self._keys.key(Channel.INFO), data, b"", "", answered_ns))
             try:
                 info = Info.parse(data)
             except UnknownVersionError as error:
@@ -132,7 +128,7 @@ class EdgePort:
                 found.append((info, requested_ns, answered_ns))
                 on_end()
 
-        request = InfoRequest(requester_id=self._requester_id, still_codecs=self._still_codecs)
+        request = InfoRequest(requester_id=self._requester_id, still_codecs=self.still_codecs)
         self._query(Channel.INFO, request.pack(), on_answer=note, on_end=on_end)
 
     def fail(self, error: Exception) -> None:
@@ -147,8 +143,8 @@ class EdgePort:
         self.received_ns = item.received_ns
         if row == Channel.STATUS and not self._reports.take(item.received_ns):
             return
-        if self._log is not None:
-            self._log(item)
+        if self.log is not None:
+            self.log(item)
         self.inbox.put(item)
         if self._flood.note(row, now_ns=item.received_ns) is not None:
             _log.warning(
@@ -181,7 +177,7 @@ class EdgePort:
 
         try:
             query_later(
-                self._session,
+                self.session,
                 row,
                 keys=self._keys,
                 question=question,
@@ -205,7 +201,7 @@ class EdgePort:
                 if self._closed:
                     return
                 if self._feedback is None:
-                    self._feedback = declare_publisher(self._session, Channel.FEEDBACK, keys=self._keys)
+                    self._feedback = declare_publisher(self.session, Channel.FEEDBACK, keys=self._keys)
                 self._feedback.put(feedback.pack())
         except zenoh.ZError as error:
             _log.debug("%s: feedback not sent: %s", self.edge, error)
@@ -220,21 +216,17 @@ class EdgePort:
                 self._feedback = None
 
 
+@dataclass(eq=False)
 class ReceiverReports:
     """Makes and sends them, in the order of their numbers; ``clock`` is Unix nanoseconds without steps."""
 
-    def __init__(
-        self,
-        publish: Callable[[Feedback], None],
-        *,
-        clock: Callable[[], int],
-        clock_offset: ClockOffset,
-        backlog: EdgeBacklog,
-    ) -> None:
-        self._publish = publish
-        self._clock = clock
-        self.clock_offset = clock_offset
-        self._backlog = backlog
+    publish: Callable[[Feedback], None]
+    _: KW_ONLY
+    clock: Callable[[], int]
+    clock_offset: ClockOffset
+    backlog: EdgeBacklog
+
+    def __post_init__(self) -> None:
         self._receiver_id = secrets.randbits(64)
         self._sequence = 0
         self._lock = threading.Lock()
@@ -246,10 +238,10 @@ class ReceiverReports:
             feedback = feedback_of(
                 receiver_id=self._receiver_id,
                 sequence=self._sequence,
-                send_ns=self._clock(),
+                send_ns=self.clock(),
                 clock_offset_ns=offset_ns,
                 clock_error_ns=error_ns,
-                backlog=self._backlog.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES),
+                backlog=self.backlog.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES),
             )
             self._sequence += 1
-            self._publish(feedback)
+            self.publish(feedback)

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from itertools import chain
 from itertools import count as count_from
@@ -130,6 +130,7 @@ _LIVE_PAUSE_S = 5.0
 _LOCKSTEP_WAIT_S = 10.0
 
 
+@dataclass(eq=False)
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
@@ -137,41 +138,33 @@ class SessionFactory:
     bring sinks and learn of the recordings, and ``program`` opens a sink of another program.
     """
 
-    def __init__(
-        self,
-        config: GroundConfig,
-        models: Models,
-        *,
-        clock: Callable[[], int],
-        outputs: Outputs,
-        view: LiveView | None,
-        services: Sequence[Service] = (),
-        program: OpenSink | None = None,
-    ) -> None:
-        self._config = config
-        self._models = models
-        self._clock = clock
-        self._outputs = outputs
-        self._view = view
-        self._services = services
-        self._program = program
-        self.records = program is None or config.record is not None
+    config: GroundConfig
+    models: Models
+    _: KW_ONLY
+    clock: Callable[[], int]
+    outputs: Outputs
+    view: LiveView | None
+    services: Sequence[Service] = ()
+    program: OpenSink | None = None
+
+    def __post_init__(self) -> None:
+        self.records = self.program is None or self.config.record is not None
         """Whether there are recordings: a program takes their place unless they are requested."""
         self._paths: set[Path] = set()
         """Taken by this process, where no file shows it."""
         self._naming = threading.Lock()
-        self._locator_of = locators(getattr(config, "terrain", None))
+        self._locator_of = locators(getattr(self.config, "terrain", None))
         self._extras = [
-            *(one.sinks for one in services),
-            *(extra.start(config, outputs) for extra in extras_of(config)),
+            *(one.sinks for one in self.services),
+            *(extra.start(self.config, self.outputs) for extra in extras_of(self.config)),
         ]
         self._timing: QueuedSink[str] | None = None
-        if config.timing is not None:
-            names = partial(free_path, [config.timing], number=2, may_exist=config.timing)
-            self._timing = outputs.open("timing table", partial(self._opened, timing_table, names))
+        if self.config.timing is not None:
+            names = partial(free_path, [self.config.timing], number=2, may_exist=self.config.timing)
+            self._timing = self.outputs.open("timing table", partial(self._opened, timing_table, names))
 
     def open_session(self, info: Info, reports: ReceiverReports) -> Session:
-        config, models, edge = self._config, self._models, info.edge
+        config, models, edge = self.config, self.models, info.edge
         stamp = time.strftime("%Y%m%d-%H%M%S")
         settings = self._recorder_settings(info)
         locator = self._locator_of(edge)
@@ -183,13 +176,13 @@ class SessionFactory:
             names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp, claim=whole)
             open_recording = partial(self._opened, self._files(settings, split=config.split), names)
             part = f"recording of {edge}"
-            sinks.append(self._outputs.open(part, open_recording, wait_s=wait_s, for_backlog=True))
-        if self._program is not None:
-            part, opens = f"program of {edge}", self._program(info)
-            sinks.append(self._outputs.open(part, opens, wait_s=wait_s, for_backlog=not self.records))
-        if self._view is not None:
-            open_live = partial(_live_recorder, settings, self._view)
-            sinks.append(self._outputs.open(f"live view of {edge}", open_live, longest_pause_s=_LIVE_PAUSE_S))
+            sinks.append(self.outputs.open(part, open_recording, wait_s=wait_s, for_backlog=True))
+        if self.program is not None:
+            part, opens = f"program of {edge}", self.program(info)
+            sinks.append(self.outputs.open(part, opens, wait_s=wait_s, for_backlog=not self.records))
+        if self.view is not None:
+            open_live = partial(_live_recorder, settings, self.view)
+            sinks.append(self.outputs.open(f"live view of {edge}", open_live, longest_pause_s=_LIVE_PAUSE_S))
         files: dict[str, QueuedSink[Event]] = {}
         for target, what, suffix, make in (
             (config.tracks, "tracks table", ".csv", TrackTable),
@@ -197,19 +190,19 @@ class SessionFactory:
         ):
             if target is not None:
                 open_file = self._new_file(target, suffix, make, edge=edge, stamp=stamp)
-                files[what] = self._outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s)
+                files[what] = self.outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s)
         sinks += files.values()
         flight = Flight(
             info,
             locator=locator,
-            clock=self._clock,
+            clock=self.clock,
             new_file=partial(self._new_file, edge=edge, stamp=stamp),
             still_address=self._still_address(info, files.get("stills")),
         )
         for one in chain.from_iterable(opens(flight) for opens in self._extras):
             pause_s = one.longest_pause_s
             held_s = wait_s if one.waits else 0.0
-            sinks.append(self._outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
+            sinks.append(self.outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         perception = SessionPerception(config, models, info)
@@ -217,7 +210,7 @@ class SessionFactory:
             info,
             sinks=sinks,
             pipeline_of=perception.pipeline,
-            clock=self._clock,
+            clock=self.clock,
             reports=reports,
             backlog_perception=perception,
             locator=locator,
@@ -227,10 +220,10 @@ class SessionFactory:
         """The recording of a session that is over; not shown live, for the viewer shows what is now."""
         settings = replace(self._recorder_settings(info), clocked=False)
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        names = partial(backlog_path, self._config.record, edge=info.edge, stamp=stamp)
+        names = partial(backlog_path, self.config.record, edge=info.edge, stamp=stamp)
         part = f"backlog recording of {info.edge}"
-        sink = self._outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
-        perception = SessionPerception(self._config, self._models, info)
+        sink = self.outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
+        perception = SessionPerception(self.config, self.models, info)
         return BacklogRecording(info, sink=sink, perception=perception)
 
     def _new_file(
@@ -242,7 +235,7 @@ class SessionFactory:
     def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> Callable[[Refinement], str]:
         # Where the picture of a still is: with a service, else in the folder of ``--stills``, else nowhere.
         def address(still: Refinement) -> str:
-            for one in self._services:
+            for one in self.services:
                 if found := one.still_address(info, still):
                     return found
             if files is None or not files.files or still.still_bgr is None or still.crop_base_px is None:
@@ -259,7 +252,7 @@ class SessionFactory:
         )
 
     def _recorded(self, row: RecordingRow) -> None:
-        for one in self._services:
+        for one in self.services:
             one.recorded(row)
 
     def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
@@ -274,13 +267,13 @@ class SessionFactory:
 
     def _give_up(self, path: Path) -> None:
         self._paths.discard(path)
-        config = self._config
+        config = self.config
         if path not in (config.record, config.tracks, config.stills) and has_nothing(path):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
 
     def _recorder_settings(self, info: Info) -> RecorderSettings:
-        config = self._config
+        config = self.config
         return RecorderSettings(
             path=None,
             edge_id=info.edge,

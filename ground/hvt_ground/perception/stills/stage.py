@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -43,32 +43,24 @@ class Progress:
     """The newest decoded frame; -1 before the first."""
 
 
+@dataclass(eq=False)
 class StillStage:
     """One session's stills. Used by one thread; ``emit`` takes the events.
 
     ``vocabulary`` is that of ``reader`` and ``refiner``.
     """
 
-    def __init__(
-        self,
-        reader: StillReader,
-        refiner: Refiner,
-        *,
-        vocabulary: Vocabulary,
-        history: History,
-        fusion: Fusion,
-        view: View,
-        gap_frames: int,
-        emit: Callable[[Event], None],
-    ) -> None:
-        self._reader = reader
-        self._refiner = refiner
-        self._vocabulary = vocabulary
-        self._history = history
-        self._gap_frames = gap_frames
-        self._fusion = fusion
-        self._view = view
-        self._emit = emit
+    reader: StillReader
+    refiner: Refiner
+    _: KW_ONLY
+    vocabulary: Vocabulary
+    history: History
+    fusion: Fusion
+    view: View
+    gap_frames: int
+    emit: Callable[[Event], None]
+
+    def __post_init__(self) -> None:
         self._pending: list[ReceivedStill] = []
         self._results: list[StillResult] = []
         self._spoilt: deque[int] = deque(maxlen=_MOST_SPOILT)
@@ -99,8 +91,8 @@ class StillStage:
         ):
             ready.append(self._pending.pop(0))
         self._read(ready, now)
-        for resolved in self._refiner.settle(
-            self._history, now_frame=now.frame_index, known_as=self._fusion.known_as
+        for resolved in self.refiner.settle(
+            self.history, now_frame=now.frame_index, known_as=self.fusion.known_as
         ):
             self._resolved(resolved, now)
 
@@ -108,7 +100,7 @@ class StillStage:
         """The session is over: waiting stills are given out as they are."""
         ready, self._pending = self._pending, []
         self._read(ready, now)
-        for resolved in self._refiner.end():
+        for resolved in self.refiner.end():
             self._resolved(resolved, now)
 
     def take_results(self) -> list[StillResult]:
@@ -121,7 +113,7 @@ class StillStage:
         # Whether its picture may yet come. A residual is nothing without it; others wait for the next frame only.
         if header.frame_index <= now.picture_index:
             return False
-        return needs_base(header) or (self._reader.wants_base and header.frame_index >= now.frame_index)
+        return needs_base(header) or (self.reader.wants_base and header.frame_index >= now.frame_index)
 
     def _read(self, stills: Sequence[ReceivedStill], now: Progress) -> None:
         by_frame: dict[int, list[tuple[ReceivedStill, DecodedStill]]] = {}
@@ -132,14 +124,14 @@ class StillStage:
         for frame_index, pairs in by_frame.items():
             # Of an outage there may be no picture, and the last one before it is not the same place any more.
             stored = any(still.header.flags & Flags.STORED for still, _ in pairs)
-            base_bgr = self._history.frame_before(frame_index, within=0 if stored else self._gap_frames)
-            readings = self._reader.read([decoded for _, decoded in pairs], base_bgr)
+            base_bgr = self.history.frame_before(frame_index, within=0 if stored else self.gap_frames)
+            readings = self.reader.read([decoded for _, decoded in pairs], base_bgr)
             for (still, decoded), objects in zip(pairs, readings.objects, strict=True):
                 self._offer(still, decoded, objects, base_bgr, now)
             if len(readings.found):
-                known = self._history.tracks(frame_index)
+                known = self.history.tracks(frame_index)
                 if known is not None:
-                    self._fusion.take_found(readings.found, known=known)
+                    self.fusion.take_found(readings.found, known=known)
 
     def _out_of_patience(self, now: Progress) -> bool:
         # Sent on purpose, then: each costs a line in the recording and, from libjpeg, one on stderr.
@@ -153,8 +145,8 @@ class StillStage:
             self._answer(header, header.track_id, None)
             return None
         try:
-            base = self._history.picture(header.frame_index)
-            image = decode_still(still, base=base, view=self._view)
+            base = self.history.picture(header.frame_index)
+            image = decode_still(still, base=base, view=self.view)
         except BaseMissingError:
             self.dropped["base_missing"] += 1
             self._notice(
@@ -184,14 +176,14 @@ class StillStage:
         now: Progress,
     ) -> None:
         header = still.header
-        crop = None if base_bgr is None else _base_crop_at(base_bgr, header.crop_source_px, view=self._view)
+        crop = None if base_bgr is None else _base_crop_at(base_bgr, header.crop_source_px, view=self.view)
         news = self._news(decoded)
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
-            side_px = min(box[2] - box[0], box[3] - box[1]) / self._view.scale
+            side_px = min(box[2] - box[0], box[3] - box[1]) / self.view.scale
             said, note = reading.posterior, ""
             if said is not None:
-                said, note = self._vocabulary.vote(said, called=header.class_name, side_px=side_px)
+                said, note = self.vocabulary.vote(said, called=header.class_name, side_px=side_px)
             self._answer(header, track_id, said)
             event = self._refinement(still, decoded, track_id, box, crop)
             if said is None:
@@ -200,17 +192,17 @@ class StillStage:
                 continue
             event = replace(event, class_after=said.class_name, confidence=said.confidence)
             seen = StillSeen(event, said, side_px, news, part, reading.box_base_px)
-            for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
+            for resolved in self.refiner.offer(seen, now_frame=now.frame_index):
                 self._resolved(resolved, now)
 
     def _news(self, decoded: DecodedStill) -> float:
         # Pixels named twice were not seen twice; on a base near the source the track's many votes are worth more.
-        base_bgr = self._history.frame(decoded.frame_index)
+        base_bgr = self.history.frame(decoded.frame_index)
         if base_bgr is None:
             return 1.0
         height, width = decoded.image_bgr.shape[:2]
         seen = base_crop(
-            base_bgr, view=self._view, crop_source_px=decoded.crop_source_px, size=(width, height)
+            base_bgr, view=self.view, crop_source_px=decoded.crop_source_px, size=(width, height)
         )
         nearness_db = psnr_y_db(seen, decoded.image_bgr)
         return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
@@ -221,7 +213,7 @@ class StillStage:
         if event.track_id is not None:
             self._name_track(event, event.track_id)
             if found is not None and not event.stored:
-                self._fusion.take_box(event.track_id, found, frame_index=event.shown_index)
+                self.fusion.take_box(event.track_id, found, frame_index=event.shown_index)
         self._give_out(event, now)
 
     def _give_out(self, event: Refinement, now: Progress) -> None:
@@ -229,7 +221,7 @@ class StillStage:
         # was stored while the link was down belongs to that time.
         if not event.stored:
             event = replace(event, frame_index=now.frame_index, capture_ns=now.capture_ns)
-        self._emit(event)
+        self.emit(event)
 
     def _refinement(
         self, still: ReceivedStill, decoded: DecodedStill, track_id: int, box: Box, crop: Image | None
@@ -281,11 +273,11 @@ class StillStage:
                 self._results[place] = replace(result, ground_track_id=ground_track_id)
 
     def _to_base(self, box_source_px: Sequence[float]) -> Box:
-        x1, y1, x2, y2 = self._view.to_base(np.array([box_source_px], np.float32))[0].tolist()
+        x1, y1, x2, y2 = self.view.to_base(np.array([box_source_px], np.float32))[0].tolist()
         return x1, y1, x2, y2
 
     def _notice(self, now: Progress, text: str) -> None:
-        self._emit(Notice(now.frame_index, now.capture_ns, "warning", text))
+        self.emit(Notice(now.frame_index, now.capture_ns, "warning", text))
 
 
 def _shown(header: RoiHeader) -> list[tuple[int, Box]]:
