@@ -80,7 +80,6 @@ class Edge:
         self._reached = False
         """Whether anybody has subscribed to the video."""
         self.ledger = Ledger(window_ns=config.window_ns)
-        """Every byte that left."""
 
     def run(self) -> dict[str, Any]:
         """Play the source to its end or until ``stop`` is set; return the summary.

@@ -30,9 +30,7 @@ class World:
         self.session_id = 1 << 31 | secrets.randbits(31)  # 5 bytes in each header, where 64 bits take 9
         self.clock: Callable[[], int] = SteadyClock()
         self.failures = Failures(self.clock)
-        """Parts that have failed in flight."""
         self.inbox = FeedbackInbox()
-        """Answers of grounds."""
         self.executor: Executor | None = None
         """Runs perception in lockstep; None: a thread of its own."""
 

@@ -59,7 +59,6 @@ class Backfill:
         self._on_done = on_done
         self.line: OrderedDict[ObjectKey, _Transfer] = OrderedDict()
         self.data: tuple[ObjectKey, bytes] | None = None
-        """The object in memory."""
         self._in_hand: ObjectKey | None = None
         """The object whose chunks were made last."""
         self._informed: set[int] = set()
@@ -75,7 +74,6 @@ class Backfill:
         self.video_first = False
         """A ground requested the video."""
         self.acknowledged_bytes = 0
-        """Bytes that grounds have acknowledged."""
         self.given_up = 0
         """Objects that were put aside because a ground did not take them."""
 

@@ -26,7 +26,6 @@ class Entry:
     """One object that is stored."""
 
     row: int
-    """Its row in the database."""
     session_id: int
     kind: BacklogKind
     number: int

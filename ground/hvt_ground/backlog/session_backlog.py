@@ -138,7 +138,6 @@ class SessionBacklog:
         self._frames = SequenceWindow()
         self._late = LateStills(ViewTilt() if perception is None else perception.tilt)
         self.totals = BacklogTotals()
-        """Totals since the start."""
         self._news = BacklogTotals()
 
     def live(self, frame_index: int, data: bytes, *, keyframe: bool, after_gap: bool) -> None:

@@ -144,7 +144,6 @@ class Models:
         self.failures = Failures(SteadyClock())
         """Models whose run raised."""
         self.detector_thread = DetectorThread()
-        """Of the detector."""
         self.facts = ModelFacts.of(config)  # a file that is not there is refused at once
         self._opened: Future[ModelSet] = Future()
         threading.Thread(target=self._load, name="hvt-models", daemon=True).start()

@@ -81,9 +81,7 @@ class EdgeSessions:
         self._pause = pause or RetryPause()
         self._beginnings = TokenBucket(burst=_BURST, every_ns=_EVERY_NS)
         self.failures = Failures(self._clock)
-        """The failures of this edge's reception."""
         self.backlog = EdgeBacklog(port.edge, recordings=recordings)
-        """The backlog of the edge."""
         self._clock_offset = ClockOffset()
         self._reports = ReceiverReports(
             port.report, clock=self._clock, clock_offset=self._clock_offset, backlog=self.backlog
@@ -100,11 +98,9 @@ class EdgeSessions:
         self.session: Session | None = None
         """The one that is open."""
         self.ended = 0
-        """Sessions that have ended."""
         self._part, self._video = f"session of {port.edge}", f"video of {port.edge}"
         self._unseen_failure = 0
         self.error: BaseException | None = None
-        """The error that ended the thread."""
         self._stopped_ns: int | None = None
 
     def start(self, *, drain_s: float = 1.0) -> Self:

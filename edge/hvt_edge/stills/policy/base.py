@@ -112,7 +112,6 @@ class Step:
     frame_index: int
     now_ns: int
     fps: float
-    """Frames a second of the base stream."""
     base_size: tuple[int, int]
     """(width, height) in base pixels."""
     cost: CostEstimate

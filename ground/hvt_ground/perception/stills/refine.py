@@ -63,9 +63,7 @@ class Refiner:
         iou: float = 0.5,
     ) -> None:
         self.tracks_refined = 0
-        """Distinct tracks of the ground that a still has refined."""
         self.class_changes = 0
-        """Stills after which the class shown was another than before."""
         self.tilt = tilt or ViewTilt()
         """Of the view: aslant no kind of vehicle is sure."""
         self._mode = mode

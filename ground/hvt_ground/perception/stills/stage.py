@@ -66,9 +66,7 @@ class StillStage:
         self._spoilt: deque[int] = deque(maxlen=_MOST_SPOILT)
         """When the last ones came that could not be decoded, in frames."""
         self.dropped: Counter[str] = Counter()
-        """Stills of which nothing could be made, by reason."""
         self.outcomes: Counter[str] = Counter()
-        """The outcome of each object in the others."""
 
     @property
     def pending(self) -> int:
