@@ -41,6 +41,7 @@ from hvt_ground.wiring import (
     SessionFactory,
     check_outputs,
     make_folders,
+    set_aside,
 )
 
 _POLL_S = 0.1
@@ -119,6 +120,7 @@ class Ground:
             stack.callback(outputs.close)
             session = stack.enter_context(open_session(settings, failures=models.failures))
             make_folders(config)
+            set_aside(config)
             client = EdgeClient.of_session(session, settings)
             for one in services:
                 one.begin(client)

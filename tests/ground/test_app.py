@@ -88,6 +88,15 @@ def test_once_it_ends_when_nobody_comes_in_time(free_port: int, tmp_path: Path, 
     assert run.sessions == []
 
 
+def test_it_writes_nothing_over_what_an_earlier_one_recorded(free_port: int, tmp_path: Path, clock) -> None:
+    """A ground that died and is started again would destroy the flight so far."""
+    (tmp_path / "f.rrd").write_text("flight")
+    run = Run(config(free_port, tmp_path / "f.rrd", once=True, wait=60.0))
+    clock.now_s = 61.0
+    eventually(lambda: run.over, what="the ground has ended")
+    assert [one.read_text() for one in tmp_path.glob("earlier-*/f.rrd")] == ["flight"]
+
+
 def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path, clock) -> None:
     """A ground that is started before its edge would be gone when that comes."""
     run = Run(config(free_port, tmp_path, once=True))

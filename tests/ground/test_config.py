@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from hvt_common.errors import UserError
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class
 from hvt_ground.sinks.line_file import has_nothing
-from hvt_ground.wiring import check_outputs, make_folders, output_path
+from hvt_ground.wiring import check_outputs, make_folders, output_path, set_aside
 from hvt_ground.wiring.sessions import backlog_path, free_path
 
 
@@ -133,6 +134,37 @@ def test_no_recording_is_written_over_another(tmp_path):
     names = [output_path(named, suffix=".rrd", edge=edge, stamp="t", taken=taken).name for edge in edges]
     assert names == ["flight.rrd", "flight-uav-2.rrd", "flight-uav-2-2.rrd", "flight-uav-1.rrd"]
     assert len(set(names)) == 4
+
+
+def test_a_ground_that_is_started_again_keeps_what_it_wrote(tmp_path, caplog):
+    """After a crash a supervisor starts it with the same names: the flight so far would be written over."""
+    folder = tmp_path / "a b %d"
+    folder.mkdir()
+    files = ["f.rrd", "t.csv", "s.csv", "s-000012.png", "l.hvtlog", "l-before.hvtlog", "m.csv", "o.mcap"]
+    for one in files:
+        (folder / one).write_text(one)
+    others = ["f-uav-2.rrd", "sum.json", "s-x.png"]
+    for one in others:
+        (folder / one).write_text(one)
+    words = ["--record f.rrd", "--tracks t.csv", "--stills s.csv", "--log l.hvtlog", "--timing m.csv"]
+    given = [word.split() for word in [*words, "--mcap o.mcap", "--summary sum.json", "--ts new.ts"]]
+    set_aside(read(*(word for option, name in given for word in (option, str(folder / name)))))
+    (earlier,) = folder.glob("earlier-*")
+    assert {one.name: one.read_text() for one in earlier.iterdir()} == {one: one for one in files}
+    assert {one.name for one in folder.iterdir()} == {*others, earlier.name}
+    assert f"--record {folder / 'f.rrd'} was there already: it is {earlier / 'f.rrd'} now" in caplog.text
+
+
+def test_on_a_full_disk_it_keeps_what_it_wrote_too(tmp_path, monkeypatch):
+    """That is what it may have died of, and a folder takes a block."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "mkdir", full)
+    (tmp_path / "f.rrd").write_text("flight")
+    set_aside(read("--record", str(tmp_path / "f.rrd")))
+    assert [one.read_text() for one in tmp_path.glob("earlier-*-f.rrd")] == ["flight"]
 
 
 def test_two_grounds_of_one_folder_never_get_one_name(tmp_path):

@@ -2,4 +2,11 @@
 
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.session import SessionPerception
-from hvt_ground.wiring.sessions import OpenSink, SessionFactory, check_outputs, make_folders, output_path
+from hvt_ground.wiring.sessions import (
+    OpenSink,
+    SessionFactory,
+    check_outputs,
+    make_folders,
+    output_path,
+    set_aside,
+)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
+from glob import escape
 from itertools import chain
 from itertools import count as count_from
 from pathlib import Path
@@ -32,6 +34,8 @@ from hvt_ground.sinks.event_tables import SessionTiming, StillFiles, TrackTable,
 from hvt_ground.sinks.line_file import claim_name, has_nothing
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+
+_log = logging.getLogger(__name__)
 
 
 def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
@@ -66,6 +70,35 @@ def make_folders(config: GroundConfig) -> None:
             raise kind(
                 f"{name} {path} cannot be made ({error.strerror}): give FILE{suffix} or a folder"
             ) from None
+
+
+def set_aside(config: GroundConfig) -> None:
+    """Move what an earlier run wrote into the named files of this one to a folder ``earlier-<time>`` beside them.
+
+    A supervisor starts a ground that died again with the same names, and a flight cannot be received twice.
+    """
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    for name, path, suffix in written(config):
+        file = path.resolve()
+        numbered = name == "--record" and config.split is not None
+        if name == "--summary" or numbered or not is_file(path, suffix) or not file.is_file():
+            continue
+        # Beside it: the pictures of a table of stills, the older half of a log.
+        stem = escape(file.stem)
+        beside = [f"{stem}-[0-9]*.png"] if name == "--stills" else [f"{stem}-before{escape(file.suffix)}"]
+        folder = file.with_name(f"earlier-{stamp}")
+        try:
+            if not file.stat().st_size:
+                continue
+            with suppress(OSError):  # on a full disk there may be no room for a folder, but for a name
+                folder.mkdir(exist_ok=True)
+            into = f"{folder}/" if folder.is_dir() else f"{folder}-"
+            for one in chain([file], *(file.parent.glob(pattern) for pattern in beside)):
+                one.rename(into + one.name)
+        except OSError as error:
+            _log.warning("%s %s is written over: it cannot be moved (%s)", name, path, error.strerror)
+        else:
+            _log.warning("%s %s was there already: it is %s now", name, path, into + file.name)
 
 
 def is_file(path: Path, suffix: str) -> bool:
