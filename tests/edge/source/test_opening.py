@@ -606,6 +606,21 @@ def test_a_stream_that_never_answers_is_given_up(free_port):
             grabber.open()
 
 
+@pytest.mark.parametrize("hangs_up", [False, True])
+def test_a_camera_that_opens_its_port_before_it_answers_is_waited_for(hangs_up):
+    """After a power cut both boot at once: the edge would end with code 2, and no supervisor starts it again."""
+    with socket.create_server(("127.0.0.1", 0)) as booting:
+
+        def hang_up() -> None:
+            booting.accept()[0].close()
+
+        grabber = StreamGrabber(f"rtsp://127.0.0.1:{booting.getsockname()[1]}/cam", open_s=0.5)
+        if hangs_up:
+            threading.Thread(target=hang_up).start()
+        with pytest.raises(NotYetError, match="no answer of RTSP in time"):
+            grabber.open()
+
+
 def test_a_missing_camera_is_one_sentence():
     """A wrong device number would end in OpenCV's own words."""
     assert "/dev/video97 does not exist" in refused("/dev/video97")
