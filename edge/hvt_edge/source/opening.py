@@ -68,7 +68,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     spec = spec if is_local(spec) else with_small_scheme(spec)
     scheme = "" if is_local(spec) else spec.partition("://")[0]
     if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
-        _check_port(spec, scheme)
+        _check_address(spec, scheme)
         stream = (CodedStreamGrabber if coded else StreamGrabber)(spec, read_s=patience_s(fps))
         stream.open()
         if isinstance(stream, CodedStreamGrabber) and not stream.holds_a_clip:
@@ -88,9 +88,12 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     return VideoSource(spec, settings)
 
 
-def _check_port(spec: str, scheme: str) -> None:
-    # FFmpeg waits for ever at a port that there is not. By UDP it also listens on ``?localport=``.
+def _check_address(spec: str, scheme: str) -> None:
+    # FFmpeg waits for ever at a port that there is not, and asks this machine where there is no host, as a script
+    # leaves it whose variable is empty. By UDP it also listens on ``?localport=``.
     address = re.split(r"[/?]", spec.partition("://")[2])[0]
+    if scheme.startswith(("rtsp", "rtmp", "http")) and address.rpartition("@")[2][:1] in {"", ":"}:
+        raise UserError(f"source {shown(spec)!r} names no host: give one, as in {scheme}://camera/stream1")
     port = re.fullmatch(r".*:([0-9]{1,5})", address)
     if scheme == "udp" and port is None:
         port = re.search(r"[?&]localport=([0-9]{1,5})(?:&|$)", spec)

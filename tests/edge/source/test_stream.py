@@ -90,6 +90,15 @@ def test_a_stream_without_a_port_is_refused(address):
         open_source(address, size=(320, 180), fps=15)
 
 
+@pytest.mark.parametrize(
+    "address", ["rtsp://", "rtsp:///stream1", "http://:80/video", "RTMP://user:word@/live"]
+)
+def test_a_stream_without_a_host_is_refused(address):
+    """A script whose variable is empty writes it: the edge asked its own machine for the camera for ever."""
+    with pytest.raises(UserError, match="names no host: give one"):
+        open_source(address, size=(320, 180), fps=15)
+
+
 @pytest.mark.parametrize("scheme", ["RTSP", "Http", "UDP"])
 def test_a_scheme_in_capitals_is_the_same(monkeypatch, scheme):
     """FFmpeg knows no RTSP://, which a phone's keyboard writes: the camera was refused (RFC 3986, 3.1)."""
