@@ -153,4 +153,7 @@ def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, An
         if replaces:
             scratch.replace(path)
     except OSError as error:
+        if replaces:
+            with contextlib.suppress(OSError):
+                scratch.unlink(missing_ok=True)
         raise FlightError(f"{path} cannot be written ({error.strerror})") from error

@@ -10,6 +10,7 @@ import io
 import re
 import threading
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import astuple, replace
 from pathlib import Path
 
@@ -94,7 +95,7 @@ class StillFiles(_EventTable):
         if item.still_sequence != self._last:
             _, data = cv2.imencode(".png", item.still_bgr)
             with telling(f"still {picture} cannot be written: "):
-                picture.write_bytes(data.tobytes())
+                _write_whole(picture, data.tobytes())
             self._last = item.still_sequence
         self._append(_still_row(item, picture.name))
 
@@ -124,6 +125,17 @@ def _place_texts(places: Places | None, row: int) -> tuple[str, str, str]:
         return "", "", ""
     latitude, longitude = places.places_deg[row]
     return f"{latitude:.7f}", f"{longitude:.7f}", f"{places.ellipses[row, 0]:.1f}"
+
+
+def _write_whole(picture: Path, data: bytes) -> None:
+    # Half a picture would be in no table, and open in no program.
+    try:
+        picture.write_bytes(data)
+    except OSError:
+        if picture.is_file():  # no device
+            with suppress(OSError):
+                picture.unlink()
+        raise
 
 
 def picture_of(still: Refinement, table: Path) -> Path:

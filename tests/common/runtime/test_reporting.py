@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import FlightError, UserError, exit_with_sentence
 from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, write_json
 
 
@@ -94,6 +96,19 @@ def test_a_result_that_cannot_be_written_is_a_sentence_and_code_1(tmp_path, caps
     assert exit_with_sentence(flight, program="hvt-edge", argv=[]) == 1
     said = capsys.readouterr().err
     assert said == f"hvt-edge: {tmp_path}/gone/summary.json cannot be written (No such file or directory)\n"
+
+
+def test_a_disk_without_room_leaves_no_half_of_a_summary(tmp_path, monkeypatch):
+    """Each start of a service on a full disk would leave an empty file there."""
+
+    def full(path: Path, *_: object, **__: object) -> int:
+        path.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(FlightError, match="No space left on device"):
+        write_json(tmp_path / "summary.json", {})
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

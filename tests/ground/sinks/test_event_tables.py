@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import errno
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -52,6 +54,22 @@ def test_a_folder_that_is_gone_is_said(tmp_path):
     with pytest.raises(UserError, match="000004"):
         sink.log(STILL)
     sink.close()
+
+
+def test_a_disk_without_room_leaves_no_half_of_a_picture(tmp_path, monkeypatch):
+    """It would lie beside the table, in which it is not, and open in no program."""
+
+    def full(path: Path, data: bytes) -> int:
+        with path.open("wb") as file:
+            file.write(data[:9])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    sink = StillFiles(tmp_path / "uav.csv")
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(UserError, match="000004"):
+        sink.log(STILL)
+    sink.close()
+    assert [one.name for one in tmp_path.iterdir()] == ["uav.csv"]
 
 
 @pytest.mark.parametrize(("origins", "expected"), [((), ["base", "base"]), (("edge+base", "still"),) * 2])
