@@ -15,6 +15,7 @@ from hvt_common.tracking import kalman
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections
+from rigs.examples import detections
 
 WIDTH, HEIGHT = 640, 360
 
@@ -172,9 +173,7 @@ def test_where_another_scene_begins_all_tracks_end() -> None:
     """Boxes of a street would stand over the next camera's picture, and one of its cars would get another's id."""
     rng = np.random.default_rng(1)
     scenes = [cv2.GaussianBlur(rng.integers(0, 255, (180, 320, 3), np.uint8), (0, 0), 6) for _ in range(2)]
-    seen = Detections(
-        np.array([[40, 40, 80, 60]], np.float32), np.array([0.9], np.float32), np.zeros(1, np.int32)
-    )
+    seen = detections([(40, 40, 80, 60)])
     tracker = ByteTracker(TrackerSettings(camera_motion="flow"), fps=15)
     listed = []
     for k, scene in enumerate([scenes[0]] * 6 + [scenes[1]] * 6):

@@ -15,22 +15,12 @@ from hvt_common.values import AccessUnit
 from hvt_edge.link.pacer import BaseInFlight
 from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_ground.link.reassemble import Arrival, Reassembler
+from rigs.messages import UnitHeader
 
 MS = 1_000_000
 FRAME_NS = 66_666_667
 STEP_NS = 10 * MS
 REPORT_NS = 150 * MS
-
-
-@dataclass(frozen=True)
-class Header:
-    """What the reassembler looks at."""
-
-    session_id: int
-    sequence: int
-    frame_index: int
-    keyframe: bool
-    flags: int = 0
 
 
 class Ground:
@@ -44,12 +34,12 @@ class Ground:
             random.Random(f"{seed}-{number}"),
         )
         self.reassembler: Reassembler = Reassembler()
-        self.air: list[tuple[int, Header]] = []
+        self.air: list[tuple[int, UnitHeader]] = []
         self.asked: set[int] = set()
         self.shown_ns: list[int] = []
         self.seen: set[int] = set()
 
-    def send(self, header: Header, now_ns: int) -> None:
+    def send(self, header: UnitHeader, now_ns: int) -> None:
         """On its way, or lost; the first is not."""
         if header.sequence == 0 or self.random.random() >= self.loss:
             self.air.append((now_ns + self.way_ns, header))
@@ -133,7 +123,7 @@ class Minute:
         if keyframe:
             self.requests.done(now_ns)
             self.requests.note_cost(self.takes_ms * MS)
-        header = Header(1, self.sent, self.sent, keyframe)
+        header = UnitHeader(1, self.sent, self.sent, keyframe)
         self.in_flight.sent(self.sent, AccessUnit(self.sent, now_ns, b"", keyframe=keyframe), now_ns=now_ns)
         self.sent += 1
         for ground in self.sees:
@@ -144,7 +134,7 @@ class Minute:
             if unit := self.in_flight.missing(sequence, now_ns=now_ns, round_trip_ns=2 * self.way_ms * MS):
                 self.resent += 1
                 self.in_flight.resent(sequence, now_ns=now_ns)
-                self.sees[0].send(Header(1, sequence, sequence, unit.keyframe, Flags.RESENT), now_ns)
+                self.sees[0].send(UnitHeader(1, sequence, sequence, unit.keyframe, Flags.RESENT), now_ns)
 
     @property
     def shown(self) -> float:

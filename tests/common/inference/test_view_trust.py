@@ -7,14 +7,13 @@ import pytest
 
 from hvt_common.inference.view_trust import ViewTrust, trust_from
 from hvt_common.values import Detections
+from rigs.examples import detections
 
 
 def many(*confidences: float) -> Detections:
     """Detections of these confidences."""
     count = len(confidences)
-    return Detections(
-        np.zeros((count, 4), np.float32), np.array(confidences, np.float32), np.zeros(count, np.int32)
-    )
+    return detections(np.zeros((count, 4)), confidences)
 
 
 WATER = many(0.6, 0.35, 0.25, 0.1)

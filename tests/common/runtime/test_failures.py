@@ -4,22 +4,12 @@ from __future__ import annotations
 
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.units import SECOND_NS
-
-
-class Time:
-    """A clock that is set."""
-
-    def __init__(self) -> None:
-        self.now_ns = 100 * SECOND_NS
-
-    def __call__(self) -> int:
-        """Now."""
-        return self.now_ns
+from rigs.examples import Clock
 
 
 def test_a_failing_part_is_said_once_and_its_return_once(caplog):
     """A full card would fill the log too; or nobody would learn that the part has stopped."""
-    clock = Time()
+    clock = Clock(100 * SECOND_NS)
     failures = Failures(clock)
     for _ in range(50):
         failures.failed("local copy", "card.mkv cannot be written")
@@ -36,7 +26,7 @@ def test_a_failing_part_is_said_once_and_its_return_once(caplog):
 
 def test_a_part_that_comes_and_goes_does_not_flood_the_log(caplog):
     """A loose camera cable would write two lines a second for hours."""
-    clock = Time()
+    clock = Clock(100 * SECOND_NS)
     failures = Failures(clock)
     for _ in range(1_000):
         failures.failed("source", "no frame")
@@ -51,7 +41,7 @@ def test_a_part_that_comes_and_goes_does_not_flood_the_log(caplog):
 
 def test_the_next_of_a_part_that_has_ended_fails_anew(caplog):
     """A session's recording failed, and is over: that of the next one fails too, and nobody would be told."""
-    clock = Time()
+    clock = Clock(100 * SECOND_NS)
     failures = Failures(clock)
     failures.over("recording", failures.failed("recording", "no room"))
     clock.now_ns += 3600 * SECOND_NS
@@ -81,7 +71,7 @@ def test_pauses_grow_to_their_limit_and_begin_anew_after_a_steady_time():
 
 def test_a_part_that_takes_long_to_fail_has_not_worked_meanwhile():
     """A network that its runtime compiles for twenty seconds, and then refuses, would burn a core for the flight."""
-    clock, opened = Time(), []
+    clock, opened = Clock(100 * SECOND_NS), []
 
     def opening() -> None:
         opened.append(clock.now_ns)

@@ -21,6 +21,7 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.flow import box_flow
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Tracks, iou
+from rigs.examples import detections
 from studies.clear_mot import Frames, score
 
 seeds = st.integers(0, 2**32 - 1)
@@ -28,11 +29,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def seen(*boxes: tuple[float, ...], confidence: float = 0.9, class_id: int = 0) -> Detections:
     """Detections x1 y1 x2 y2 of equal confidence and class."""
-    return Detections(
-        np.array(boxes, np.float32).reshape(-1, 4),
-        np.full(len(boxes), confidence, np.float32),
-        np.full(len(boxes), class_id, np.int32),
-    )
+    return detections(boxes, confidence, class_id)
 
 
 def scene(seed: int, *, frames: int = 12, count: int = 8) -> list[Detections]:
@@ -47,13 +44,7 @@ def scene(seed: int, *, frames: int = 12, count: int = 8) -> list[Detections]:
         boxes = np.round((boxes + rng.normal(0, 1.5, boxes.shape)) * 16) / 16
         kept = rng.random(count) > 0.15
         confidences = np.clip(rng.beta(4, 2, count), 0, 1)
-        result.append(
-            Detections(
-                boxes[kept].astype(np.float32),
-                confidences[kept].astype(np.float32),
-                rng.integers(0, 3, int(kept.sum())).astype(np.int32),
-            )
-        )
+        result.append(detections(boxes[kept], confidences[kept], rng.integers(0, 3, int(kept.sum()))))
     return result
 
 

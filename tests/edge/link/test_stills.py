@@ -6,19 +6,9 @@ import logging
 
 from hvt_common.protocol.messages import InfoRequest
 from hvt_edge.link.stills import StillReaders
+from rigs.examples import Clock
 
 S = 1_000_000_000
-
-
-class Clock:
-    """Stands still until it is set."""
-
-    def __init__(self) -> None:
-        self.now_ns = 10**18
-
-    def __call__(self) -> int:
-        """Now."""
-        return self.now_ns
 
 
 def request(requester: int, *codecs: str) -> InfoRequest:
@@ -33,7 +23,7 @@ def read(readers: StillReaders, *codecs: str) -> list[str]:
 
 def test_all_grounds_have_to_read_a_codec(caplog):
     """The second screen would stay without stills."""
-    readers = StillReaders(Clock())
+    readers = StillReaders(Clock(10**18))
     assert read(readers, "residual", "anything") == ["residual", "anything"], "nobody has said anything"
     readers.on_request(request(1, "jpeg", "residual", "avif"))
     assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "residual", "avif"]
@@ -47,7 +37,7 @@ def test_all_grounds_have_to_read_a_codec(caplog):
 def test_a_ground_that_reads_no_video_of_the_edge_is_told_of(caplog):
     """Its screen would stay black, and nobody would know why."""
     caplog.set_level(logging.WARNING)
-    readers = StillReaders(Clock())
+    readers = StillReaders(Clock(10**18))
     readers.on_request(request(1, "jpeg"))
     assert caplog.messages == []
     for _ in range(2):
@@ -59,7 +49,7 @@ def test_a_ground_that_reads_no_video_of_the_edge_is_told_of(caplog):
 
 def test_a_ground_that_has_gone_counts_for_a_minute():
     """A look from a phone would cost the bits of all that follows."""
-    clock = Clock()
+    clock = Clock(10**18)
     readers = StillReaders(clock)
     readers.on_request(request(1, "jpeg"))
     clock.now_ns += 60 * S
@@ -71,7 +61,7 @@ def test_a_ground_that_has_gone_counts_for_a_minute():
 def test_strangers_do_not_fill_the_edge(caplog):
     """Numbers cost their sender nothing: each would take memory, and its codec a line of the log."""
     caplog.set_level(logging.WARNING)
-    readers = StillReaders(Clock())
+    readers = StillReaders(Clock(10**18))
     readers.on_request(request(0, "jpeg"))
     for number in range(1, 1000):
         readers.on_request(request(number, "jpeg", "residual"))

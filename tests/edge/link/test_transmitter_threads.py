@@ -16,6 +16,7 @@ from hvt_common.protocol.messages import BacklogKind, RoiHeader
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Chunk
+from rigs.examples import Clock
 from rigs.keeping import STILL, Out
 from rigs.world import make_transmitter
 
@@ -106,17 +107,6 @@ def test_a_still_whose_put_blocks_holds_up_no_base_frame():
     assert [channel for channel, _, _ in rig.out.puts] == [Channel.BASE] * 30 + [Channel.ROI]
 
 
-class Clock:
-    """One for all, in steps of a hundredth of a second."""
-
-    def __init__(self) -> None:
-        self.now_ns = NOW_NS
-
-    def __call__(self) -> int:
-        """Now."""
-        return self.now_ns
-
-
 def frames(rig: Rig, clock: Clock) -> Iterator[None]:
     """The frame loop: each step is one that another thread may come between."""
     for index in count():
@@ -154,7 +144,7 @@ def stored(rig: Rig, clock: Clock) -> Iterator[None]:
 @pytest.mark.parametrize("seed", range(4))
 def test_three_threads_keep_to_one_budget_in_whatever_order_they_run(seed):
     """The hard limit would be hard for one thread only: 105000 bytes in a window of 100000."""
-    rig, clock, chance = Rig(), Clock(), random.Random(seed)
+    rig, clock, chance = Rig(), Clock(NOW_NS), random.Random(seed)
     threads = [one(rig, clock) for one in (frames, stills, stored)]
     for _ in range(1_000):
         clock.now_ns += S // 100

@@ -20,7 +20,7 @@ from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
-from rigs.examples import tracks_of
+from rigs.examples import detections, tracks_of
 
 FPS = 15
 PERIOD_NS = 1_000_000_000 // FPS
@@ -35,12 +35,7 @@ def box(place: int) -> list[float]:
 
 def found(*places: int, confidence: float = 0.8, class_id: int = 0) -> Detections:
     """What the detector says of the base."""
-    count = len(places)
-    return Detections(
-        np.array([box(place) for place in places], np.float32).reshape(-1, 4),
-        np.full(count, confidence, np.float32),
-        np.full(count, class_id, np.int32),
-    )
+    return detections([box(place) for place in places], confidence, class_id)
 
 
 def seen(index: int, confidences: dict[int, float], scene_began: int = -1) -> AnalyzedFrame:
@@ -78,11 +73,8 @@ def test_the_gain_is_that_of_the_formula():
 def test_what_the_base_shows_in_error_counts():
     """A ground that is sent tracks lists it no longer, and auto would send none for want of hidden objects."""
     objects = dict.fromkeys(range(18), 0.9)
-    base = Detections(
-        np.array([box(place) for place in (*range(18), *range(30, 34), 40)], np.float32),
-        np.array([0.8] * 18 + [0.5] * 4 + [0.95], np.float32),
-        np.zeros(23, np.int32),
-    )
+    boxes = [box(place) for place in (*range(18), *range(30, 34), 40)]
+    base = detections(boxes, [0.8] * 18 + [0.5] * 4 + [0.95])
     shadow = compared(base, confidences=objects).now
     recall = min(0.9, (18 + 10 * 18 / (19 + 2)) / (19 + 10))  # see `Recall`
     weak, strong = (c * (1 - recall) / (c * (1 - recall) + 1 - c) for c in (0.5, 0.95))

@@ -8,7 +8,6 @@ import socket
 import threading
 import time
 
-import numpy as np
 import pytest
 
 from hvt_common.inference.detect import Detector
@@ -19,6 +18,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from programs.processes import Link, eventually, free_ports
 from programs.rtsp_camera import RtspCamera
+from rigs.examples import detections
 from rigs.watched_flight import SMALL, STORE_BYTES, asked, series, state, status
 from rigs.world import PassedOn
 
@@ -144,9 +144,7 @@ class SlowDetector(Detector):
     def detect(self, image_bgr: Image) -> Detections:
         """See there."""
         time.sleep(1.5)
-        return Detections(
-            np.array([[50, 50, 90, 80]], np.float32), np.array([0.9], np.float32), np.zeros(1, np.int32)
-        )
+        return detections([(50, 50, 90, 80)])
 
 
 class SlowWorld(World):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,21 +21,11 @@ from hvt_ground.link.reassemble import (
     Reassembler,
 )
 from rigs.footprint import footprint_bytes
+from rigs.messages import UnitHeader
 
 FRAME_NS = 1_000_000_000 // 15
 MS = 1_000_000
 MAX_U64 = (1 << 64) - 1
-
-
-@dataclass(frozen=True)
-class Header:
-    """The fields of a base header that count here."""
-
-    session_id: int
-    sequence: int
-    frame_index: int
-    keyframe: bool
-    flags: int = 0
 
 
 class Ground:
@@ -53,7 +41,7 @@ class Ground:
         """Let one unit arrive ``after_ns`` later; (verdict, sequence) of all that is settled by it."""
         self.now_ns += after_ns
         self._sent += 1
-        header = Header(session, sequence, sequence * 2 if frame is None else frame, key, flags)
+        header = UnitHeader(session, sequence, sequence * 2 if frame is None else frame, key, flags)
         resolved = self.core.accept(header, b"%d/%d" % (session, sequence), now_ns=self.now_ns)
         self.out += resolved
         return [(unit.verdict, unit.header.sequence) for unit in resolved]

@@ -31,22 +31,13 @@ from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
 from programs.outsider import joined
 from programs.processes import PATIENT_S, eventually
+from rigs.examples import Clock
 from rigs.flight import Flight
 
 SESSIONS, WARM, HALF = 200, 59, 70
 FRAMES = 6
 MOST_GROWTH_BYTES, MOST_BLOCKS = 20_000, 100
 """A session. Threads that happen to close a recording at that moment hold less than that."""
-
-
-class Clock:
-    """Stands while a session flies, however long that takes; between two an edge has to be silent for seconds."""
-
-    def __init__(self) -> None:
-        self.now_ns = time.time_ns()
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 class Held:
@@ -141,7 +132,7 @@ def served(link: GroundLink, folder: Path, ended: list[str], clock: Clock) -> It
 @pytest.mark.nightly
 def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Path) -> None:
     """After a night with a drone that restarts every minute the ground would be killed for its memory."""
-    endpoint, ended, clock = f"tcp/127.0.0.1:{free_port}", list[str](), Clock()
+    endpoint, ended, clock = f"tcp/127.0.0.1:{free_port}", list[str](), Clock(time.time_ns())
     watching = threading.Event()
     maker = StateMaker(time.time_ns)
 

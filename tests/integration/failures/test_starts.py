@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -33,7 +33,7 @@ from hvt_edge.world import World
 from hvt_fleet.health.server import Answer, HealthServer
 from hvt_ground.sinks.rerun.live_view import LiveView, listening
 from hvt_web.server import WebPage
-from programs.processes import eventually, free_ports
+from programs.processes import answers, eventually, free_ports
 from programs.rtsp_camera import RtspCamera
 
 _HOLD = """
@@ -59,13 +59,6 @@ class Holder:
     def let_go(self) -> None:
         """The port is free."""
         self._process.communicate("")
-
-
-def answers(port: int) -> bool:
-    """Whether a TCP server is there."""
-    with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
-        return True
-    return False
 
 
 @contextmanager

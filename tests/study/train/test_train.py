@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from hvt_common.values import Detections
 from hvt_train.evaluate import average_precision, evaluate_drawn, evaluate_real
 from hvt_train.pictures.fleet import make_solid
 from hvt_train.pictures.places import Picture, draw_place
 from hvt_train.pictures.pool import PoolPlan, fill_pool, shoot
 from hvt_train.pictures.views import ViewSettings, ViewSource, degrade
+from rigs.examples import detections
 
 CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 
@@ -141,11 +141,7 @@ class Fixed:
     class_names = CLASSES
 
     def __init__(self, boxes, scores, kinds):
-        self.found = Detections(
-            np.array(boxes, np.float32).reshape(-1, 4),
-            np.array(scores, np.float32),
-            np.array(kinds, np.int32),
-        )
+        self.found = detections(boxes, scores, kinds)
 
     def detect(self, image_bgr):
         """Return what was given."""

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -67,6 +68,13 @@ _ports = functools.cache(_Ports)
 def free_ports(number: int) -> list[int]:
     """TCP ports that nobody listens on at this moment, all different, and that no other test process picks."""
     return [_ports().free() for _ in range(number)]
+
+
+def answers(port: int) -> bool:
+    """Whether a TCP server is there on loopback."""
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+        return True
+    return False
 
 
 def eventually(true: Callable[[], object], *, what: str = "that it is so") -> None:

@@ -8,11 +8,32 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.values import Posterior, Tracks
+from hvt_common.values import Detections, Posterior, Tracks
 from hvt_edge.perception.candidates import Candidate
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.perception.stills.decode import Box
 from hvt_ground.perception.stills.match import StillSeen
+
+
+class Clock:
+    """Stands still until it is set."""
+
+    def __init__(self, now_ns: int) -> None:
+        self.now_ns = now_ns
+
+    def __call__(self) -> int:
+        """Now."""
+        return self.now_ns
+
+
+def detections(boxes: Any, confidences: Any = 0.9, classes: Any = 0) -> Detections:
+    """What a detector finds in ``boxes``; a value is that of all, or one for each."""
+    boxes = np.array(boxes, np.float32).reshape(-1, 4)
+
+    def each(value: Any, kind: Any) -> npt.NDArray[Any]:
+        return np.broadcast_to(np.asarray(value, kind), len(boxes)).copy()
+
+    return Detections(boxes, each(confidences, np.float32), each(classes, np.int32))
 
 
 def tracks_of(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hvt_common.protocol.messages import (
@@ -29,6 +29,18 @@ from hvt_common.protocol.messages import (
 from hvt_common.protocol.messages.fields import I63, U32, U64
 from hvt_edge.link.feedback import Report
 from hvt_edge.link.stills import Still
+
+
+@dataclass(frozen=True)
+class UnitHeader:
+    """The fields of a base header that the ground's reassembler looks at."""
+
+    session_id: int
+    sequence: int
+    frame_index: int
+    keyframe: bool
+    flags: int = 0
+
 
 BASE = BaseHeader(
     session_id=0x1234567890ABCDEF,

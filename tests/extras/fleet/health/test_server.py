@@ -8,7 +8,6 @@ import json
 import socket
 import threading
 import time
-from contextlib import suppress
 from http.server import HTTPServer
 from socketserver import ThreadingMixIn
 
@@ -21,7 +20,7 @@ from hvt_common.errors import FlightError
 from hvt_common.runtime.failures import Failures
 from hvt_fleet.health.server import Answer, HealthServer
 from hvt_fleet.health.status_command import StatusCommand
-from programs.processes import eventually, free_ports
+from programs.processes import answers, eventually, free_ports
 
 STATE = {"/state.json": lambda: Answer(json.dumps({"latitude_deg": 52.1}).encode())}
 
@@ -36,13 +35,6 @@ def asked(port: int, host: str | None) -> int:
     status = connection.getresponse().status
     connection.close()
     return status
-
-
-def answers(port: int) -> bool:
-    """Whether it is there."""
-    with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
-        return True
-    return False
 
 
 @pytest.mark.parametrize(

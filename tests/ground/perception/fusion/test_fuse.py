@@ -7,9 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hvt_common.values import Detections, Tracks
+from hvt_common.values import Tracks
 from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from rigs.examples import detections
 from rigs.flight import tracks_at
 from rigs.footprint import footprint_bytes
 
@@ -43,10 +44,7 @@ class Ground:
 
     def found(self, index, *boxes):
         """Objects in a still of a frame, buses."""
-        count = len(boxes)
-        found = Detections(
-            np.array(boxes, np.float32), np.full(count, 0.9, np.float32), np.ones(count, np.int32)
-        )
+        found = detections(boxes, classes=1)
         self.fusion.take_found(found, known=self.fusion.listed(self.fusion.own_at(index)).tracks)
 
 

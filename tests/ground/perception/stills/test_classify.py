@@ -24,6 +24,7 @@ from hvt_ground.perception.stills.classify import (
 from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import DecodedStill
 from media.onnx_models import colour_classifier
+from rigs.examples import detections
 
 SOURCE, BASE = (1280, 720), (320, 180)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
@@ -56,11 +57,7 @@ class Bright:
                 if area > 20:
                     boxes.append([x, y, x + width, y + height])
                     classes.append(class_id)
-        return Detections(
-            np.array(boxes, np.float32).reshape(-1, 4),
-            np.full(len(boxes), 0.8, np.float32),
-            np.array(classes, np.int32),
-        )
+        return detections(boxes, 0.8, classes)
 
 
 def test_redetection_names_each_still_by_what_is_found_at_its_place():
@@ -96,11 +93,8 @@ class Says:
     def detect(self, image_bgr: Image) -> Detections:
         """The rows, each a box, a confidence and a class."""
         self.seen.append(image_bgr)
-        return Detections(
-            np.array([box for box, _, _ in self.rows], np.float32).reshape(-1, 4),
-            np.array([confidence for _, confidence, _ in self.rows], np.float32),
-            np.array([class_id for _, _, class_id in self.rows], np.int32),
-        )
+        boxes, confidences, classes = zip(*self.rows, strict=True) if self.rows else ((), (), ())
+        return detections(boxes, confidences, classes)
 
 
 def test_all_stills_of_a_frame_are_one_run():
