@@ -13,8 +13,8 @@ from hvt_archive.joined import join_recordings
 from hvt_archive.screenshot import main, screenshot
 from hvt_common.errors import UserError
 from hvt_ground.events import Notice
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import coded, drawn_frames, session
+from programs import rrd
 from programs.rrd import Recording
 
 needs_viewer = pytest.mark.skipif(
@@ -28,12 +28,8 @@ def test_the_screen_shows_video_gallery_and_boxes(tmp_path: Path) -> None:
     """A recording that opens as an error message or an empty grid is not finished."""
     frames = drawn_frames(30, (640, 384))
     path, out = tmp_path / "a.rrd", tmp_path / "a.png"
-    settings = RecorderSettings(
-        path=path, edge_id="uav-1", session="1", base_size=(640, 384), fps=15.0, budget_bps=600_000.0
-    )
-    with Recorder(settings) as recorder:
-        for event, _ in session(frames, coded(frames, kbps=400), tracks=6, total_kbps=900):
-            recorder.log(event)
+    feed = session(frames, coded(frames, kbps=400), tracks=6, total_kbps=900)
+    rrd.recorded(path, (event for event, _ in feed), base_size=(640, 384), budget_bps=600_000.0)
     assert main([str(path), "--frame", "25", "--out", str(out), "--size", "1280x800"]) == 0
     picture = cv2.imread(str(out))
     assert picture.shape[1] == 1280
@@ -60,12 +56,8 @@ def test_a_missing_recording_is_one_sentence(tmp_path: Path) -> None:
 
 
 def recorded(path, edge):
-    settings = RecorderSettings(
-        path=path, edge_id=edge, session="01", base_size=(64, 48), fps=15, budget_bps=1e5
-    )
-    with Recorder(settings) as recorder:
-        recorder.log(Notice(3, 200_000_000, "info", f"here is {edge}"))
-    return path
+    notice = Notice(3, 200_000_000, "info", f"here is {edge}")
+    return rrd.recorded(path, [notice], edge_id=edge, session="01", base_size=(64, 48))
 
 
 def test_each_edge_keeps_what_is_its_own(tmp_path):

@@ -9,14 +9,13 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Self
 
 import av
 import numpy as np
 import pytest
 
 from hvt_common.inference.view_trust import ViewTrust
-from hvt_common.protocol.ledger import Account, overhead_bytes
+from hvt_common.protocol.ledger import Account
 from hvt_common.protocol.messages import (
     AcknowledgedRange,
     BacklogUnit,
@@ -36,141 +35,90 @@ from hvt_ground.perception.session import FIRST_TRACK_ID
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.report.status import completed, summary, table
-from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.event_tables import SessionTiming, timing_table
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.rerun.still_places import SLOTS
-from programs.processes import PATIENT_S, eventually
-from programs.rrd import Recording
+from programs.processes import eventually
+from programs.rrd import Recording, settings_of
 from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.examples import overlay, seen
 from rigs.flight import (
     CLASSES,
     Flight,
-    Port,
     RedSquares,
     SameAnswer,
     StoredPerception,
+    line_bytes,
     patient_worker,
     pipeline_of,
     square_box,
 )
-from rigs.handled import WatchedInbox, check, end
+from rigs.handled import ReceiverRig
 
 FIRST_STORED = 2**31
 PICTURE = DecodedFrame(0, 0, 0, np.zeros((8, 8, 3), np.uint8))
 
 
-def settings(info: Info, path: Path, **changes) -> RecorderSettings:
-    """As `hvt_ground.app` makes them."""
-    return RecorderSettings(
-        path=path,
-        edge_id=info.edge,
-        session=f"{info.session_id:08x}",
-        base_size=info.base_size,
-        fps=info.fps,
-        budget_bps=info.budget_bps,
-        **changes,
-    )
-
-
-class Rig:
-    """A receiver with a port; sessions and former sessions with recordings in a folder."""
+class Rig(ReceiverRig):
+    """Sessions and former sessions with recordings in a folder."""
 
     def __init__(
         self,
         folder: Path,
         flight: Flight,
         *,
-        pipeline=pipeline_of,
         detector_of=RedSquares,
         timing=None,
         most_files=32,
-        patience_s=5.0,
-        ended_patience_s=2.0,
-        worker_of=patient_worker,
-        **recorder,
-    ):
+        compact_bytes=None,
+        **rest,
+    ) -> None:
         self.folder = folder
         self.backlog_folder: Path | None = None
-        self._detector_of = detector_of
-        self._pipeline = pipeline
-        self._timing = timing
-        self._worker_of = worker_of
-        self._recorder = recorder
+        self._detector_of, self._timing = detector_of, timing
+        self._recorder = {} if compact_bytes is None else {"compact_bytes": compact_bytes}
         self.failures = Failures(time.time_ns)
         self.outputs = Outputs(self.failures)
-        self.port = Port()
-        self.port.inbox = self.inbox = WatchedInbox()
-        self.port.flight = flight
-        self.flight = flight
-        self.opened: list[Session] = []
-        self.ended: list[Session] = []
         self._backlog_numbers = itertools.count()
         self.live: list[Received] = []
         self.recordings = BacklogRecordings(self._open_backlog, most_files=most_files, open_s=20)
-        self.receiver = EdgeSessions(
-            self.port,
-            open_session=self._open,
-            on_ended=self.ended.append,
-            recordings=self.recordings,
-            patience_s=patience_s,
-            ended_patience_s=ended_patience_s,
-        )
-        self.receiver.start(drain_s=PATIENT_S)
+        super().__init__(flight, recordings=self.recordings, **rest)
 
     def put_former(self, former: Flight, still: bytes) -> None:
         """A still of a former session, as its edge sends it."""
         sid = former.session_id
         self.put(*chunks(sid, "info", 0, info_object(former)), *chunks(sid, "still", 0, still))
 
-    def _open(self, info: Info, reports: ReceiverReports) -> Session:
-        path = self.folder / f"{len(self.opened)}.rrd"
-        sinks: list[Sink] = [self._sink(info, path)]
+    def sinks_of(self, info: Info) -> list[Sink]:
+        """A recording, and a table of times where there is one."""
+        sinks: list[Sink] = [self._sink(info, self.folder / f"{len(self.opened)}.rrd")]
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
-        session = Session(
-            info,
-            sinks=sinks,
-            pipeline_of=self._pipeline,
-            clock=time.time_ns,
-            reports=reports,
-            backlog_perception=StoredPerception(info, detector_of=self._detector_of),
-            worker_of=None if info.pace == "lockstep" else self._worker_of,
-        )
-        self.opened.append(session)
-        return session
+        return sinks
+
+    def backlog_perception(self, info: Info) -> StoredPerception:
+        """With such detectors."""
+        return StoredPerception(info, detector_of=self._detector_of)
 
     def _open_backlog(self, info: Info) -> BacklogRecording:
         path = (self.backlog_folder or self.folder) / f"backlog-{next(self._backlog_numbers)}.rrd"
         return BacklogRecording(info, sink=self._sink(info, path), perception=StoredPerception(info))
 
     def _sink(self, info: Info, path: Path) -> QueuedSink:
-        made = settings(info, path, **self._recorder)
+        made = settings_of(info, path, **self._recorder)
         return self.outputs.open("recording", lambda: Recorder(made))
 
     def put(self, *items: Received) -> None:
         """What Zenoh's callback does, and then all of it is handled and seen."""
         self.live += items
-        for item in items:
-            self.inbox.put(item)
-        self._wait_for(lambda: self.inbox.handled)
-        self._wait_for(
-            lambda: self.receiver.backlog.working == 0
-        )  # the receiving thread hands boxes on to perception
-        for session in self.opened:
-            self._wait_for(lambda one=session: one.idle)
-        self._wait_for(lambda: self.outputs.idle)
-
-    def _wait_for(self, condition) -> None:
-        eventually(
-            lambda: condition() or self.receiver.error is not None or bool(self.receiver.failures.parts)
-        )
-        check(self.receiver)
+        super().put(*items)
+        self.wait_for(lambda: self.inbox.handled)
+        # The receiving thread hands boxes on to perception.
+        self.wait_for(lambda: self.receiver.backlog.working == 0)
+        self.settle()
+        self.wait_for(lambda: self.outputs.idle)
 
     def base(self, *indices: int) -> None:
         """Access units as they come."""
@@ -183,22 +131,13 @@ class Rig:
 
     def reported(self) -> Feedback:
         """A report that speaks of all that was put."""
-        self._wait_for(lambda: self.inbox.handled)
+        self.wait_for(lambda: self.inbox.handled)
         before = len(self.port.reports)
-        self._wait_for(lambda: len(self.port.reports) >= before + 2)  # one may have been under way
+        self.wait_for(lambda: len(self.port.reports) >= before + 2)  # one may have been under way
         return self.port.reports[-1]
 
-    @property
-    def session(self) -> Session:
-        """The one that is open."""
-        assert self.receiver.session is not None
-        return self.receiver.session
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind, *_) -> None:
-        end(self.receiver, failing=kind is not None)
+    def __exit__(self, kind, *rest) -> None:
+        super().__exit__(kind, *rest)
         self.outputs.close(within_s=60)
         assert all(one.working for one in self.failures.parts)
 
@@ -458,12 +397,7 @@ def test_pieces_are_in_the_account_to_the_byte(flight, tmp_path):
         kept = backlog(flight, "still", 3, still_object(flight, 4, 3), chunk_bytes=200)
         rig.put(*kept, *kept[:2], *chunks(other.session_id, "still", 0, still_object(other, 1, 0)))
         assert rig.session.reception.ledger.messages(Account.BACKLOG) == len(kept) + 3
-        assert rig.session.reception.ledger.line_bytes == sum(
-            len(one.payload)
-            + len(one.attachment)
-            + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
-            for one in rig.live
-        )
+        assert rig.session.reception.ledger.line_bytes == line_bytes(rig.live)
         pressed = rig.session.reception.ledger.summary(1.0).backlog_bytes
         assert pressed == sum(len(one.payload) for one in rig.live if one.key.endswith("/backlog"))
 
@@ -589,7 +523,7 @@ def test_a_recording_in_use_stays_open(flight, tmp_path):
 
     def open_one(info: Info) -> BacklogRecording:
         path = tmp_path / f"{len(made)}.rrd"
-        sink = outputs.open("recording", lambda: Recorder(settings(info, path)))
+        sink = outputs.open("recording", lambda: Recorder(settings_of(info, path)))
         made.append(BacklogRecording(info, sink=sink, perception=StoredPerception(info)))
         return made[-1]
 
@@ -836,27 +770,6 @@ def test_stills_do_not_wait_for_boxes_in_stored_video():
         worker.close()
     worker.raise_error()
     assert closed, "the models that one in the middle has checked out would never be given back"
-
-
-def test_a_worker_is_not_idle_while_it_analyzes():
-    """Whoever waits for it would count what it has not made anything of yet."""
-    began, may_end = threading.Event(), threading.Event()
-
-    def see(_picture, _hurry, _newer) -> None:
-        began.set()
-        assert may_end.wait(60)
-
-    worker = patient_worker(see, lambda *_: None, lambda _stills: None)
-    try:
-        worker.picture(PICTURE)
-        assert began.wait(60)
-        assert not worker.idle
-        may_end.set()
-        eventually(lambda: worker.idle)
-    finally:
-        may_end.set()
-        worker.close()
-    worker.raise_error()
 
 
 def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():

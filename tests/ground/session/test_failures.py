@@ -20,9 +20,9 @@ from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import Recorder
 from programs.processes import eventually
-from programs.rrd import Recording
+from programs.rrd import Recording, settings_of
 from rigs.flight import Flight, Port, pipeline_of
 from rigs.handled import WatchedInbox
 
@@ -58,14 +58,7 @@ class Consumer:
         if self.broken == "opening":
             raise OSError(28, "No space left on device")
         path = self.folder / f"{info.edge}-{len(self.sessions)}.rrd"
-        settings = RecorderSettings(
-            path=path,
-            edge_id=info.edge,
-            session=f"{info.session_id:08x}",
-            base_size=info.base_size,
-            fps=info.fps,
-            budget_bps=info.budget_bps,
-        )
+        settings = settings_of(info, path)
         sink = QueuedSink("recording", lambda: Recorder(settings), failures=Failures(time.time_ns))
         session = Session(
             info,

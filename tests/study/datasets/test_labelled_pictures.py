@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -76,108 +75,55 @@ def read(place: Path) -> list[tuple[LabelledPicture, FrameLabels]]:
     return found
 
 
-def ultralytics(root: Path) -> None:
-    """With a list over several lines, and one of the splits empty of labels."""
-    picture(root / "images/train/a.jpg")
-    text(root / "labels/train/a.txt", ROW)
-    text(
-        root / "data.yaml",
-        "path: .\ntrain: images/train\nnames:\n  0: car\n  1: 'bus'  # large\nnc: 2\n",
-        "utf-8-sig",
-    )
+LAYOUTS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
+    "Ultralytics, with a list over several lines": (
+        "images/train/a.jpg",
+        {
+            "labels/train/a.txt": ROW,
+            "data.yaml": (
+                "path: .\ntrain: images/train\nnames:\n  0: car\n  1: 'bus'  # large\nnc: 2\n",
+                "utf-8-sig",
+            ),
+        },
+    ),
+    "Roboflow, a folder a split": (
+        "train/images/a_jpg.rf.1.jpg",
+        {
+            "train/labels/a_jpg.rf.1.txt": ROW,
+            "data.yaml": "train: ../train/images\nnc: 2\nnames: ['car', 'bus']\n",
+        },
+    ),
+    "Roboflow, COCO": ("valid/a.jpg", {"valid/_annotations.coco.json": coco()}),
+    "FiftyOne, YOLOv5Dataset": (
+        "images/val/a.jpg",
+        {"labels/val/a.txt": ROW, "dataset.yaml": "names:\n- car\n- bus\nnc: 2\n"},
+    ),
+    "FiftyOne, COCODetectionDataset": ("data/a.jpg", {"labels.json": coco()}),
+    "labelImg": ("a.jpg", {"a.txt": ROW, "classes.txt": "car\nbus\n"}),
+    "labelImg, VOC": ("a.jpg", {"a.xml": (voc(), "utf-8-sig")}),
+    "CVAT, YOLO 1.1": ("obj_train_data/a.jpg", {"obj_train_data/a.txt": ROW, "obj.names": "car\nbus\n"}),
+    "CVAT, COCO 1.0": ("images/a.jpg", {"annotations/instances_default.json": coco()}),
+    "CVAT, PASCAL VOC 1.1": ("JPEGImages/a.jpg", {"Annotations/a.xml": voc()}),
+    "Label Studio": ("images/a.jpg", {"labels/a.txt": ROW, "classes.txt": ("car\nbus\n", "utf-16")}),
+    "Label Studio, COCO, from Windows": (
+        "images/a.jpg",
+        {"result.json": (coco("images\\a.jpg"), "utf-8-sig")},
+    ),
+}
 
 
-def roboflow(root: Path) -> None:
-    """A folder a split."""
-    picture(root / "train/images/a_jpg.rf.1.jpg")
-    text(root / "train/labels/a_jpg.rf.1.txt", ROW)
-    text(root / "data.yaml", "train: ../train/images\nnc: 2\nnames: ['car', 'bus']\n")
-
-
-def roboflow_coco(root: Path) -> None:
-    """JSON among the pictures."""
-    picture(root / "valid/a.jpg")
-    text(root / "valid/_annotations.coco.json", coco())
-
-
-def fiftyone(root: Path) -> None:
-    """YOLOv5Dataset."""
-    picture(root / "images/val/a.jpg")
-    text(root / "labels/val/a.txt", ROW)
-    text(root / "dataset.yaml", "names:\n- car\n- bus\nnc: 2\n")
-
-
-def fiftyone_coco(root: Path) -> None:
-    """COCODetectionDataset."""
-    picture(root / "data/a.jpg")
-    text(root / "labels.json", coco())
-
-
-def label_img(root: Path) -> None:
-    """Beside the pictures."""
-    picture(root / "a.jpg")
-    text(root / "a.txt", ROW)
-    text(root / "classes.txt", "car\nbus\n")
-
-
-def label_img_voc(root: Path) -> None:
-    """The same as XML."""
-    picture(root / "a.jpg")
-    text(root / "a.xml", voc(), "utf-8-sig")
-
-
-def cvat(root: Path) -> None:
-    """YOLO 1.1."""
-    picture(root / "obj_train_data/a.jpg")
-    text(root / "obj_train_data/a.txt", ROW)
-    text(root / "obj.names", "car\nbus\n")
-
-
-def cvat_coco(root: Path) -> None:
-    """COCO 1.0."""
-    picture(root / "images/a.jpg")
-    text(root / "annotations/instances_default.json", coco())
-
-
-def cvat_voc(root: Path) -> None:
-    """PASCAL VOC 1.1."""
-    picture(root / "JPEGImages/a.jpg")
-    text(root / "Annotations/a.xml", voc())
-
-
-def label_studio(root: Path) -> None:
-    """YOLO."""
-    picture(root / "images/a.jpg")
-    text(root / "labels/a.txt", ROW)
-    text(root / "classes.txt", "car\nbus\n", "utf-16")
-
-
-def label_studio_coco(root: Path) -> None:
-    """From Windows, with a byte order mark."""
-    picture(root / "images/a.jpg")
-    text(root / "result.json", coco("images\\a.jpg"), "utf-8-sig")
-
-
-LAYOUTS = (
-    ultralytics,
-    roboflow,
-    roboflow_coco,
-    fiftyone,
-    fiftyone_coco,
-    label_img,
-    label_img_voc,
-    cvat,
-    cvat_coco,
-    cvat_voc,
-    label_studio,
-    label_studio_coco,
-)
+def lay(root: Path, layout: str) -> None:
+    """One picture and its labels, as that tool lays them."""
+    shown, files = LAYOUTS[layout]
+    picture(root / shown)
+    for name, content in files.items():
+        text(root / name, *(content if isinstance(content, tuple) else (content,)))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_layouts_of_tools_are_found(tmp_path: Path, layout: Callable[[Path], None]) -> None:
+def test_the_layouts_of_tools_are_found(tmp_path: Path, layout: str) -> None:
     """Whoever labels with another tool would have to move a thousand files first."""
-    layout(tmp_path)
+    lay(tmp_path, layout)
     ((one, labels),) = read(tmp_path)
     assert labels.class_names == ("bus",)
     np.testing.assert_allclose(labels.boxes_xyxy_px, [BOX], atol=0.01)
@@ -199,7 +145,7 @@ def test_labels_that_nothing_finds_are_said_with_the_places(tmp_path: Path) -> N
 
 def test_one_bad_row_costs_itself_alone(tmp_path: Path) -> None:
     """A side of 1.0005, which exporters write, ended the whole set."""
-    label_img(tmp_path)
+    lay(tmp_path, "labelImg")
     rows = [
         "0 0.25 0.50025 0.5 1.0005",
         "0 0.9 0.5 0.4 0.2",
@@ -248,7 +194,7 @@ def test_boxes_of_coco_are_cut_at_the_picture(
 
 def test_a_set_without_a_good_row_is_refused(tmp_path: Path) -> None:
     """Of labels in pixels nothing is right, and a recall of nothing would be said."""
-    label_img(tmp_path)
+    lay(tmp_path, "labelImg")
     text(tmp_path / "a.txt", "1 50 35 60 50\n")
     ((one, _),) = read(tmp_path)
     with pytest.raises(UserError, match=r"a\.txt, line 1 has a box outside the picture"):

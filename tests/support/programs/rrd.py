@@ -11,6 +11,7 @@ from typing import Any
 
 from rerun.chunk import Chunk, RrdReader
 
+from hvt_common.protocol.messages import Info
 from hvt_ground.events import Event
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 
@@ -39,6 +40,12 @@ def settings(path: Path | None, **changes: Any) -> RecorderSettings:
     """Of a small recording."""
     small = RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0, {"method": "M5"})
     return replace(small, **changes)
+
+
+def settings_of(info: Info, path: Path, **changes: Any) -> RecorderSettings:
+    """As a ground makes them for a session."""
+    session = f"{info.session_id:08x}"
+    return RecorderSettings(path, info.edge, session, info.base_size, info.fps, info.budget_bps, **changes)
 
 
 def recorded(path: Path, events: Iterable[Event], **changes: Any) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
@@ -18,6 +18,7 @@ from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.channels import MSGPACK_ENCODING
+from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.protocol.messages import (
     BaseHeader,
     Feedback,
@@ -335,6 +336,15 @@ class Flight:
             levers="",
         )
         return _received("status", report.pack(), b"", "")
+
+
+def line_bytes(items: Iterable[Received]) -> int:
+    """What all of them take on the line."""
+    return sum(
+        one.size_bytes
+        + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
+        for one in items
+    )
 
 
 def _received(row: str, payload: bytes, attachment: bytes, encoding: str) -> Received:

@@ -36,6 +36,7 @@ from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.live_view import viewer_program
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
+from programs import rrd
 from programs.processes import eventually
 from programs.rrd import Recording, ends_its_reader
 
@@ -55,8 +56,7 @@ def events() -> list[Event]:
 
 def settings(folder: Path) -> RecorderSettings:
     """Of a session whose files have names of ours."""
-    path = folder / f"{STEM}.rrd"
-    return RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0)
+    return rrd.settings(folder / f"{STEM}.rrd")
 
 
 def fly(folder: Path, events: list[Event], retention: Retention = ALL) -> Failures:
@@ -77,6 +77,12 @@ def flown(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path
     folder = tmp_path_factory.mktemp("flown")
     fly(folder, events)
     return folder
+
+
+@pytest.fixture
+def copied(flown: Path, tmp_path: Path) -> Path:
+    """Such a folder, for one test."""
+    return copytree(flown, tmp_path, dirs_exist_ok=True)
 
 
 def look(
@@ -114,26 +120,24 @@ def test_it_says_what_is_in_each_file(tmp_path, events):
     assert failures.parts == ()
 
 
-def test_files_tell_the_same_when_the_index_is_lost(tmp_path, flown):
+def test_files_tell_the_same_when_the_index_is_lost(copied):
     """After a damaged card everything would have to be searched by hand."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
-    before = read_index(tmp_path)
-    (tmp_path / INDEX).unlink()
-    (tmp_path / "mine.rrd").write_bytes((tmp_path / NAMES[0]).read_bytes())
-    (tmp_path / "hvt-uav-1-20261122-140000.rrd").write_text("no recording")
+    before = read_index(copied)
+    (copied / INDEX).unlink()
+    (copied / "mine.rrd").write_bytes((copied / NAMES[0]).read_bytes())
+    (copied / "hvt-uav-1-20261122-140000.rrd").write_text("no recording")
     with rr.RecordingStream("hvt-uav-1", recording_id="uav-1-00ff") as odd:
-        odd.save(tmp_path / "hvt-uav-1-20261122-150000.rrd")
+        odd.save(copied / "hvt-uav-1-20261122-150000.rrd")
         boxes = rr.Boxes2D(centers=[[1, 2]], half_sizes=[[1, 2]], class_ids=[3])
         odd.log("/base/tracks", boxes, rr.AnyValues(track_id=pa.array([[1, 2]])))
-    after = look(tmp_path)
+    after = look(copied)
     assert [replace(one, written_ns=0) for one in after] == [replace(one, written_ns=0) for one in before]
 
 
 @pytest.mark.parametrize("damage", ["text", "zeros", "half", "empty"])
-def test_a_damaged_index_is_set_aside_and_made_anew(tmp_path, flown, caplog, damage):
+def test_a_damaged_index_is_set_aside_and_made_anew(copied, caplog, damage):
     """No flight could be recorded with an index, until somebody removes a file that he does not know."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
-    index = tmp_path / INDEX
+    index = copied / INDEX
     data = index.read_bytes()
     index.write_bytes(
         {
@@ -144,8 +148,8 @@ def test_a_damaged_index_is_set_aside_and_made_anew(tmp_path, flown, caplog, dam
         }[damage]
     )
     with caplog.at_level(logging.WARNING):
-        assert [one.file for one in look(tmp_path)] == NAMES
-    aside = list(tmp_path.glob(f"{INDEX}.damaged-*"))
+        assert [one.file for one in look(copied)] == NAMES
+    aside = list(copied.glob(f"{INDEX}.damaged-*"))
     assert len(aside) == (damage != "empty")
     assert len(caplog.messages) == (damage != "empty")
 
@@ -218,27 +222,25 @@ def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
     assert [one.file for one in look(tmp_path)] == NAMES
 
 
-def test_by_age_and_by_bytes(tmp_path, flown, caplog):
+def test_by_age_and_by_bytes(copied, caplog):
     """The disk is full after a month."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
     day = Retention((Limit(seconds=86_400),))
-    assert len(look(tmp_path, day, later_s=80_000)) == 2
-    first, second = read_index(tmp_path)
+    assert len(look(copied, day, later_s=80_000)) == 2
+    first, second = read_index(copied)
     least = Retention((Limit(size_bytes=second.size_bytes),))
-    assert [one.file for one in look(tmp_path, least)] == [second.file]
-    assert not (tmp_path / first.file).exists()
+    assert [one.file for one in look(copied, least)] == [second.file]
+    assert not (copied / first.file).exists()
     caplog.clear()
     with caplog.at_level(logging.WARNING):
-        assert look(tmp_path, day, later_s=90_000) == []
+        assert look(copied, day, later_s=90_000) == []
     assert caplog.messages == [f"recording {second.file} is removed: it is older than --keep allows"]
-    assert list(tmp_path.glob("*.rrd")) == []
+    assert list(copied.glob("*.rrd")) == []
 
 
-def test_by_age_one_goes_at_a_time(tmp_path, flown):
+def test_by_age_one_goes_at_a_time(copied):
     """Whatever went wrong with a clock, there would be nothing left to look at when it is noticed."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
     day = Retention((Limit(seconds=86_400),))
-    assert [one.file for one in look(tmp_path, day, later_s=90_000)] == NAMES[1:]
+    assert [one.file for one in look(copied, day, later_s=90_000)] == NAMES[1:]
 
 
 CLOCKS = Retention((Limit(seconds=90 * 86_400.0),), Limit(seconds=14 * 86_400.0))
@@ -246,40 +248,37 @@ YEAR_S = 365 * 86_400.0
 
 
 @pytest.mark.parametrize("set_by_s", [100 * 86_400.0, 2 * YEAR_S, 56 * YEAR_S, -2 * YEAR_S])
-def test_a_clock_that_is_set_removes_nothing(tmp_path, flown, set_by_s):
+def test_a_clock_that_is_set_removes_nothing(copied, set_by_s):
     """NTP comes after the flight, or the clock is years ahead: the flight of a minute ago would be gone."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
     for step_s in (set_by_s, 0.0, set_by_s):  # in flight, and at the next starts
-        rows = look(tmp_path, CLOCKS, set_by_s=step_s, later_s=60, times=3)
+        rows = look(copied, CLOCKS, set_by_s=step_s, later_s=60, times=3)
         assert [(one.file, one.video) for one in rows] == [(name, True) for name in NAMES]
-        rows = look(tmp_path, CLOCKS, set_by_s=step_s, later_s=7200, times=3)
+        rows = look(copied, CLOCKS, set_by_s=step_s, later_s=7200, times=3)
         assert [(one.file, one.video) for one in rows] == [(name, True) for name in NAMES]
 
 
 @pytest.mark.parametrize("ahead_s", [2 * YEAR_S, -56 * YEAR_S])
-def test_a_clock_that_is_wrong_after_a_boot_removes_nothing(tmp_path, flown, ahead_s):
+def test_a_clock_that_is_wrong_after_a_boot_removes_nothing(copied, ahead_s):
     """The clock of a machine without a battery says anything: nobody knows how long it was off."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
     clock = {
         "now_ns": lambda: time.time_ns() + round(ahead_s * 1e9),
         "since_boot": lambda: ("the next", since_boot_ns()),
     }
-    with closing(IndexWriter(tmp_path, CLOCKS, **clock)) as writer:
+    with closing(IndexWriter(copied, CLOCKS, **clock)) as writer:
         for _ in range(3):
             writer.log(None)
-    assert [(one.file, one.video) for one in read_index(tmp_path)] == [(name, True) for name in NAMES]
+    assert [(one.file, one.video) for one in read_index(copied)] == [(name, True) for name in NAMES]
 
 
-def test_files_that_no_look_has_seen_before_are_not_old(tmp_path, flown):
+def test_files_that_no_look_has_seen_before_are_not_old(copied):
     """A copied folder, or a lost index: their times are those of the copy, or of a clock that nobody knows."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
-    (tmp_path / INDEX).unlink()
+    (copied / INDEX).unlink()
     for one in NAMES:
-        os.utime(tmp_path / one, (0, 0))
-        (tmp_path / one).rename(tmp_path / one.replace(STEM, "hvt-uav-1-20200202-020202"))
+        os.utime(copied / one, (0, 0))
+        (copied / one).rename(copied / one.replace(STEM, "hvt-uav-1-20200202-020202"))
     week = Retention((Limit(seconds=7 * 86_400.0),))
-    assert len(look(tmp_path, week, times=3)) == 2
-    assert len(look(tmp_path, week, later_s=8 * 86_400)) == 1
+    assert len(look(copied, week, times=3)) == 2
+    assert len(look(copied, week, later_s=8 * 86_400)) == 1
 
 
 def test_by_bytes_the_newest_stays_whatever_the_clock_says(tmp_path, events):
@@ -300,17 +299,16 @@ def test_by_bytes_the_newest_stays_whatever_the_clock_says(tmp_path, events):
     assert [one.file for one in read_index(tmp_path)] == files[1:]
 
 
-def test_what_somebody_removed_does_not_count(tmp_path, flown):
+def test_what_somebody_removed_does_not_count(copied):
     """Another would be removed to make room that is there."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
-    rows = read_index(tmp_path)
+    rows = read_index(copied)
     both = Retention((Limit(size_bytes=sum(one.size_bytes for one in rows)),))
     third = f"{STEM}-0003.rrd"
-    with closing(IndexWriter(tmp_path, both)) as writer:
-        (tmp_path / NAMES[1]).rename(tmp_path / third)
+    with closing(IndexWriter(copied, both)) as writer:
+        (copied / NAMES[1]).rename(copied / third)
         writer.log(replace(rows[1], file=third))
-    assert [one.file for one in read_index(tmp_path)] == [NAMES[0], third]
-    assert sorted(one.name for one in tmp_path.glob("*.rrd")) == [NAMES[0], third]
+    assert [one.file for one in read_index(copied)] == [NAMES[0], third]
+    assert sorted(one.name for one in copied.glob("*.rrd")) == [NAMES[0], third]
 
 
 def test_only_files_of_ours_in_the_folder_are_removed(tmp_path, flown):
@@ -370,46 +368,43 @@ def test_video_is_removed_and_the_rest_stays(tmp_path, events):
     assert [one.video for one in look(tmp_path)] == [False, False]
 
 
-def test_a_file_that_breaks_off_is_smaller_without_its_video(tmp_path, flown):
+def test_a_file_that_breaks_off_is_smaller_without_its_video(copied):
     """Its footer, a row for each chunk, takes more than the pictures of a file that was cut short by a power cut."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
-    path = tmp_path / NAMES[0]
+    path = copied / NAMES[0]
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2 - 37])
     before = path.stat().st_size
-    first, _ = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
+    first, _ = look(copied, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
     assert (first.video, first.size_bytes < before) == (False, True)
     assert first.size_bytes == path.stat().st_size
     assert Recording(path).video() == []
     assert Recording(path).blueprints == 1
 
 
-def test_a_damaged_file_is_stripped_too(tmp_path, flown):
+def test_a_damaged_file_is_stripped_too(copied):
     """Rerun's own program refuses it, so its video stayed, and each minute it was tried again."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
-    path = tmp_path / NAMES[0]
+    path = copied / NAMES[0]
     path.write_bytes(ends_its_reader(path.read_bytes()))
-    rows = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
+    rows = look(copied, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
     assert [one.video for one in rows] == [False, False]
     assert Recording(path).video() == []
     assert Recording(path).boxes(20)
 
 
-def test_a_file_that_ends_the_process_of_its_reader_ends_no_ground(tmp_path, flown):
+def test_a_file_that_ends_the_process_of_its_reader_ends_no_ground(copied):
     """On some damage the SDK does not raise: the ground was gone, at each start."""
-    copytree(flown, tmp_path, dirs_exist_ok=True)
-    path = tmp_path / NAMES[0]
+    path = copied / NAMES[0]
     path.write_bytes(ends_its_reader(path.read_bytes()))
-    before, _ = read_index(tmp_path)
-    (tmp_path / INDEX).unlink()
+    before, _ = read_index(copied)
+    (copied / INDEX).unlink()
     script = f"""
 from pathlib import Path
 from hvt_archive.index.folder import IndexWriter
 from hvt_archive.index.retention import Retention
-IndexWriter(Path({str(tmp_path)!r}), Retention()).close()
+IndexWriter(Path({str(copied)!r}), Retention()).close()
 """
     subprocess.run([sys.executable, "-c", script], check=True)
-    after, _ = read_index(tmp_path)
+    after, _ = read_index(copied)
     assert (after.frames, after.begin_ns, after.end_ns) == (before.frames, before.begin_ns, before.end_ns)
 
 

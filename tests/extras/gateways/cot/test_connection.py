@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from cryptography.hazmat.primitives import serialization
@@ -76,7 +76,10 @@ class Server:
             if isinstance(made, ssl.SSLSocket) and self._reads:
                 made.unwrap()  # else a client waits half a minute for the answer to its goodbye
 
-    def close(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """As a process ends: the port is free, the connections are cut."""
         self._listening.shutdown(socket.SHUT_RDWR)
         self._listening.close()
@@ -212,11 +215,8 @@ def test_a_server_that_restarts_gets_events_again_and_it_is_said_once(port, capl
         return not sink.is_open()
 
     for _ in range(2):
-        server = Server(port)
-        try:
+        with Server(port) as server:
             eventually(lambda now=server: arrives(now), what="events come")
-        finally:
-            server.close()
         eventually(lambda: noticed(sink), what="the end of the server is noticed")
     assert ended(sink)
     assert next(one for one in caplog.messages if "tried again" in one).endswith(
@@ -228,8 +228,7 @@ def test_a_server_that_restarts_gets_events_again_and_it_is_said_once(port, capl
 
 def test_a_server_that_takes_nothing_gets_the_newest_of_each_afterwards(port):
     """It would hold up the flight, or be told for minutes where things were long ago."""
-    server = Server(port, reads=False)
-    try:
+    with Server(port, reads=False) as server:
         connection = CotConnection(f"tcp://127.0.0.1:{port}", {})
         eventually(lambda: server.connections, what="the connection")
         server.connections[0].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
@@ -245,14 +244,11 @@ def test_a_server_that_takes_nothing_gets_the_newest_of_each_afterwards(port):
             last = {part.split(b'"')[1]: int(part.split(b'"')[3]) for part in parts}
         assert len(received) < 3_000_000, "what was replaced was not sent"
         connection.close()
-    finally:
-        server.close()
 
 
 def test_a_server_that_talks_is_heard_out(port):
     """A TAK server passes on what all others say, and cuts off whoever does not take it."""
-    server = Server(port)
-    try:
+    with Server(port) as server:
         connection = CotConnection(f"tcp://127.0.0.1:{port}", {})
         eventually(lambda: server.connections, what="the connection")
         server.connections[0].settimeout(PATIENT_S)
@@ -260,14 +256,11 @@ def test_a_server_that_talks_is_heard_out(port):
         connection.log(message("still"))
         eventually(lambda: server.uids == ["still"], what="it goes on")
         connection.close()
-    finally:
-        server.close()
 
 
 def test_what_waits_at_the_end_is_sent(port):
     """The last seconds of a flight would be missing."""
-    server = Server(port)
-    try:
+    with Server(port) as server:
         sink, failures = sink_of(f"tcp://127.0.0.1:{port}")
         assert sink.is_open(within_s=PATIENT_S)
         for number in range(500):
@@ -275,14 +268,11 @@ def test_what_waits_at_the_end_is_sent(port):
         assert ended(sink)
         eventually(lambda: len(server.uids) == 500, what="all of it")
         assert failures.parts == ()
-    finally:
-        server.close()
 
 
 def test_events_go_over_tls_with_the_certificate_of_the_client(port, fleet):
     """TAK Server takes nothing else."""
-    server = Server(port, tls=demanding(fleet))
-    try:
+    with Server(port, tls=demanding(fleet)) as server:
         url, said = f"tls://127.0.0.1:{port}", keys(fleet)
         check_connection(url, said)
         sink, failures = sink_of(url, said)
@@ -296,8 +286,6 @@ def test_events_go_over_tls_with_the_certificate_of_the_client(port, fleet):
         assert names["commonName"] == "client"
         assert ended(sink)
         assert failures.parts == ()
-    finally:
-        server.close()
 
 
 @pytest.mark.parametrize("password", ["atakatak", "50%%s=${x}"])
@@ -317,14 +305,11 @@ def test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, password):
     with pytest.raises(UserError, match="cannot use the certificate"):
         check_connection(url, {**said, "PYTAK_TLS_CLIENT_PASSWORD": "wrong"})
     check_connection(url, said)
-    server = Server(port, tls=demanding(fleet))
-    try:
+    with Server(port, tls=demanding(fleet)) as server:
         connection = CotConnection(url, said)
         connection.log(message("secret"))
         eventually(lambda: server.uids == ["secret"], what="it is sent")
         connection.close()
-    finally:
-        server.close()
 
 
 def test_certificate_and_key_may_be_in_one_file(port, fleet, tmp_path):
@@ -352,8 +337,7 @@ def test_certificates_that_do_not_fit_are_said(port, fleet, tmp_path, server_nam
     fleet.reissue("expired", "127.0.0.1", now=EXPIRED)
     for suffix in ("pem", "key"):
         (tmp_path / f"stranger.{suffix}").write_bytes((other.folder / f"stranger.{suffix}").read_bytes())
-    server = Server(port, tls=demanding(fleet, server_name))
-    try:
+    with Server(port, tls=demanding(fleet, server_name)) as server:
         said = keys(fleet, **{name: str(tmp_path / file) for name, file in changes.items()})
         sink, failures = sink_of(f"tls://127.0.0.1:{port}", said)
 
@@ -364,21 +348,16 @@ def test_certificates_that_do_not_fit_are_said(port, fleet, tmp_path, server_nam
         eventually(refused, what=f"{reason}; there is {failures.parts}")
         assert server.uids == []
         assert ended(sink)
-    finally:
-        server.close()
 
 
 def test_a_server_that_never_shakes_hands_does_not_hold_up_the_end(port, fleet, monkeypatch):
     """Ctrl-C would be answered with kill -9."""
     monkeypatch.setattr(cot_connection, "CONNECT_S", 0.3)
-    server = Server(port, reads=False)
-    try:
+    with Server(port, reads=False):
         sink, failures = sink_of(f"tls://127.0.0.1:{port}", keys(fleet))
         eventually(lambda: failures.parts, what="it is given up")
         assert failures.parts[0].reason == f"tls://127.0.0.1:{port}: it does not answer"
         assert ended(sink)
-    finally:
-        server.close()
 
 
 @pytest.mark.parametrize(

@@ -12,19 +12,13 @@ import pytest
 
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.rrd_file import open_rrd
+from programs import rrd
 from programs.processes import eventually
 
 
 def settings_of(folder: Path, number: int = 0) -> RecorderSettings:
     """A small recording."""
-    return RecorderSettings(
-        path=folder / "flight.rrd",
-        edge_id="uav-1",
-        session=f"{number:x}",
-        base_size=(320, 192),
-        fps=15,
-        budget_bps=800_000,
-    )
+    return rrd.settings(folder / "flight.rrd", session=f"{number:x}")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
