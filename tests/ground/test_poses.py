@@ -21,31 +21,23 @@ def pose(second: float, *, north: float = 0.0, yaw: float = 0.0) -> Pose:
     )
 
 
-def test_between_two_it_is_on_the_line():
-    """Places would jump once a second."""
+@pytest.mark.parametrize(
+    ("second", "north", "yaw", "position_error_m"),
+    [(0.25, 5, 2.5, 3.0), (1.5, 30, 15.0, (3**2 + 5**2) ** 0.5)],
+    ids=["between two it is on the line", "after the last it goes on and is less sure"],
+)
+def test_a_pose_at_a_moment(second, north, yaw, position_error_m):
+    """Places would jump once a second, or stay where the drone was a second ago."""
     trail = PoseTrail()
     trail.add(pose(0))
     trail.add(pose(1, north=20, yaw=10))
-    found = trail.at(SECOND_NS // 4)
+    found = trail.at(round(second * SECOND_NS))
     assert found is not None
-    assert found.latitude_deg == pytest.approx(50 + 5 / 111_229, abs=1e-8)
+    assert found.latitude_deg == pytest.approx(50 + north / 111_229, abs=1e-8)
     assert found.camera is not None
-    assert found.camera.yaw_deg == pytest.approx(2.5)
-    assert found.angle_error_deg == 2.0
-
-
-def test_after_the_last_it_goes_on_and_is_less_sure():
-    """A picture between two reports would be placed where the drone was a second ago."""
-    trail = PoseTrail()
-    trail.add(pose(0))
-    trail.add(pose(1, north=20, yaw=10))
-    found = trail.at(round(1.5 * SECOND_NS))
-    assert found is not None
-    assert found.latitude_deg == pytest.approx(50 + 30 / 111_229, abs=1e-8)
-    assert found.camera is not None
-    assert found.camera.yaw_deg == pytest.approx(15)
-    assert found.position_error_m == pytest.approx((3**2 + 5**2) ** 0.5, rel=0.01)
-    assert found.angle_error_deg > 2.0
+    assert found.camera.yaw_deg == pytest.approx(yaw)
+    assert found.position_error_m == pytest.approx(position_error_m, rel=0.01)
+    assert (found.angle_error_deg > 2.0) == (second > 1)
 
 
 def test_a_camera_that_stands_is_as_sure_as_it_was():

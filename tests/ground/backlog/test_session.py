@@ -402,20 +402,6 @@ def test_pieces_are_in_the_account_to_the_byte(flight, tmp_path):
         assert pressed == sum(len(one.payload) for one in rig.live if one.key.endswith("/backlog"))
 
 
-def test_the_end_waits_for_the_last_piece(flight, tmp_path):
-    """The last still of an outage would be cut off, though it is on the line."""
-    with Rig(tmp_path, flight, ended_patience_s=3600) as rig:
-        rig.base(*range(5))
-        data = still_object(flight, 2, 0)
-        one, two = backlog(flight, "still", 0, data, chunk_bytes=(len(data) + 1) // 2)
-        report = flight.status(base=5, state="ended", backlog=2)
-        rig.put(one, report)
-        assert not rig.receiver.idle
-        rig.put(two)
-        eventually(lambda: rig.ended)
-        assert rig.ended[0].backlog.totals.stills == 1
-
-
 def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path):
     """What an edge saw before it was started again would be lost, or stand in another flight's recording."""
     former = Flight(45, keyframes=(20,))

@@ -14,7 +14,7 @@ from hvt_common.units import SECOND_NS
 from hvt_ground.link.receiver import Uptime
 from hvt_ground.link.reception import REPORT_LINE_BYTES, Reception
 from rigs.footprint import footprint_bytes
-from rigs.messages import BACKLOG, INFO, ROI
+from rigs.messages import BACKLOG, INFO, ROI, STATUS, STEP
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -241,6 +241,24 @@ class Progress(int):
         came.join(0.1)  # it has to wait its turn
         self.threads.append(came)
         return int(self) - other
+
+
+@pytest.mark.parametrize("last", ["base", "roi", "tracks", "backlog"])
+def test_all_has_come_when_each_of_the_edges_counts_is_reached(last):
+    """The last picture, still, list of tracks or stored still of a flight would be cut off."""
+    reception = begun()
+    counts = replace(STATUS, base_messages=1, roi_messages=1, meta_messages=1, backlog_messages=1)
+    reception.status(counts, message("status", 100, 0))
+    comes = {
+        "base": lambda: base(reception, 0, arrived_ns=0),
+        "roi": lambda: still(reception, 0, arrived_ns=0),
+        "tracks": lambda: reception.tracks(STEP, message("tracks", 100, 0)),
+        "backlog": lambda: chunk(reception, arrived_ns=0),
+    }
+    for one in (*(comes.keys() - {last}), last):
+        assert not reception.is_whole
+        comes[one]()
+    assert reception.is_whole
 
 
 def test_a_still_may_come_while_a_report_is_made():

@@ -295,26 +295,17 @@ def test_people_whom_the_edge_never_finds_are_listed():
     assert listed[-8:] == [5] * 8
 
 
-def test_a_class_that_the_edge_cannot_name_is_ours_to_say():
-    """Boats would vanish beside the cars that both know, and at an edge with `motion` whatever stands."""
+@pytest.mark.parametrize(
+    "seen_as", [[(2, True)] * 6, [(0, False), (2, True)]], ids=["from the start", "later"]
+)
+def test_a_class_that_the_edge_cannot_name_is_ours_to_say(seen_as):
+    """Boats would vanish beside the cars that both know; one first taken for a car would be hidden to the end."""
     ground = Ground(own=("car", "bus", "boat"), edge=("car", "bus"))
-    for index in range(0, 30, 5):
-        tracks = tracks_at(index, {**CROWD, GHOST[0]: GHOST[1]})
-        tracks.class_ids[-1] = 2
-        tracks.confidences[-1] = 0.5
-        ground.fusion.take_own(tracks)
-        ground.step(index, CROWD_AT_EDGE)
-        assert ("base", whole(GHOST[1])) in brief(ground.fusion.listed(tracks)).values()
-
-
-def test_what_turns_out_to_be_of_another_class_is_no_longer_doubted():
-    """A boat that was first taken for a car would be hidden to the end."""
-    ground = Ground(own=("car", "bus", "boat"), edge=("car", "bus"))
-    for index, class_id, is_listed in ((0, 0, False), (5, 2, True)):
-        tracks = tracks_at(index, {**CROWD, GHOST[0]: GHOST[1]})
+    for step, (class_id, is_listed) in enumerate(seen_as):
+        tracks = tracks_at(5 * step, {**CROWD, GHOST[0]: GHOST[1]})
         tracks.class_ids[-1], tracks.confidences[-1] = class_id, 0.5
         ground.fusion.take_own(tracks)
-        ground.step(index, CROWD_AT_EDGE)
+        ground.step(5 * step, CROWD_AT_EDGE)
         listed = brief(ground.fusion.listed(tracks)).values()
         assert (("base", whole(GHOST[1])) in listed) == is_listed
 

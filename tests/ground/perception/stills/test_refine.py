@@ -150,28 +150,26 @@ def rows(matcher, frame_index, boxes, *wanted):
     return [-1 if isinstance(one, str) else one[1] for one in (found[want.key] for want in wanted)]
 
 
-def test_a_track_is_another_edge_tracks_own_only_for_a_while():
-    """When the edge gives an object a new id, its stills would be refused for the rest of the flight."""
-    matcher = Matcher(least_iou=0.5, owned_frames=20)
-    assert rows(matcher, 5, {1: A}, FIRST) == [0]
-    assert rows(matcher, 25, {1: A}, OTHER) == [-1]
-    assert rows(matcher, 26, {1: A}, OTHER) == [0]
-
-
-def test_a_track_that_its_owner_has_left_is_free():
-    """After an exchange of ids on the ground, the second object would be refused as the first one's."""
-    matcher = Matcher(least_iou=0.5, owned_frames=1000)
-    assert rows(matcher, 5, {1: A}, FIRST) == [0]
-    assert rows(matcher, 6, {1: (300, 100, 340, 120), 2: A}, FIRST) == [1]
-    assert rows(matcher, 7, {1: A}, OTHER) == [0]
-
-
-def test_an_older_still_does_not_overrule_what_a_newer_one_showed():
-    """A late still from before an exchange of ids would bring the old posterior back."""
-    matcher = Matcher(least_iou=0.5, owned_frames=1000)
-    assert rows(matcher, 9, {2: A}, FIRST) == [0]
-    assert rows(matcher, 5, {1: A}, FIRST) == [0]
-    assert rows(matcher, 10, {2: A}, OTHER) == [-1], "2 is still the first one's own"
+@pytest.mark.parametrize(
+    ("owned_frames", "steps"),
+    [
+        # When the edge gives an object a new id, its stills would be refused for the rest of the flight.
+        (20, [(5, {1: A}, FIRST, 0), (25, {1: A}, OTHER, -1), (26, {1: A}, OTHER, 0)]),
+        # After an exchange of ids on the ground, the second object would be refused as the first one's.
+        (
+            1000,
+            [(5, {1: A}, FIRST, 0), (6, {1: (300, 100, 340, 120), 2: A}, FIRST, 1), (7, {1: A}, OTHER, 0)],
+        ),
+        # A late still from before an exchange of ids would bring the old posterior back: 2 is still the first one's.
+        (1000, [(9, {2: A}, FIRST, 0), (5, {1: A}, FIRST, 0), (10, {2: A}, OTHER, -1)]),
+    ],
+    ids=["for a while", "until its owner has left", "whatever an older still shows"],
+)
+def test_a_track_is_another_edge_tracks_own(owned_frames, steps):
+    """Objects that came near each other would get each other's class."""
+    matcher = Matcher(least_iou=0.5, owned_frames=owned_frames)
+    for frame, boxes, wanted, row in steps:
+        assert rows(matcher, frame, boxes, wanted) == [row]
 
 
 def test_a_lost_frame_refines_nothing(ground):
