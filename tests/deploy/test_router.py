@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import queue
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -20,31 +18,12 @@ import zenoh
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings
-from programs.processes import eventually
+from programs.processes import eventually, router
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 KEYS = EdgeKeys("uav-1")
 
 pytestmark = pytest.mark.integration
-
-
-def _lines(process: subprocess.Popen[str]) -> queue.Queue[str]:
-    lines: queue.Queue[str] = queue.Queue()
-    assert process.stdout is not None
-    stream = process.stdout
-    threading.Thread(target=lambda: [lines.put(line) for line in stream], daemon=True).start()
-    return lines
-
-
-@contextmanager
-def _router(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, str(DEPLOY / "router.py"), *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert "listens on" in _lines(process).get(timeout=60)
-            yield process
-        finally:
-            process.kill()
 
 
 def _first(
@@ -82,7 +61,7 @@ def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> 
     endpoint = f"tcp/127.0.0.1:{free_port}"
     ground = LinkSettings(role="ground", connect=(endpoint,))
     with ExitStack() as stack:
-        stack.enter_context(_router("--listen", endpoint))
+        stack.enter_context(router("--listen", endpoint))
         edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))
         other = stack.enter_context(
             open_session(ground) if receiver != "client" else zenoh.open(_client(endpoint))
@@ -113,7 +92,7 @@ def test_a_ground_that_comes_before_its_router_finds_it(free_port: int) -> None:
         edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))
         samples = ground.declare_subscriber(selector(Channel.BASE))
         publisher = declare_publisher(edge, Channel.BASE, keys=KEYS)
-        stack.enter_context(_router("--listen", endpoint))
+        stack.enter_context(router("--listen", endpoint))
         eventually(lambda: publisher.matching_status.matching)
         assert _first(samples, lambda: publisher.put(b"first")).payload.to_bytes() == b"first"
 
@@ -123,7 +102,7 @@ def test_a_signal_ends_it_cleanly(free_port: int, how: signal.Signals) -> None:
     """Otherwise systemd and Docker would wait for their time-out and kill it, and note a failure."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     calling = LinkSettings(role="edge", connect=(endpoint,))
-    with _router("--listen", endpoint) as process, open_session(calling) as edge:
+    with router("--listen", endpoint) as process, open_session(calling) as edge:
         eventually(lambda: list(edge.info.routers_zid()))
         process.send_signal(how)
         assert process.wait() == 0

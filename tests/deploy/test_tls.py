@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +15,7 @@ from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 from programs.fleet_keys import Fleet
-from programs.processes import eventually
+from programs.processes import eventually, router
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 EDGES = ("rov-1", "uav-1")
@@ -91,18 +88,6 @@ class _Ground:
             self.session.put(EdgeKeys(edge).key(Channel.FEEDBACK), text)
 
 
-@contextmanager
-def _router(file: Path, endpoint: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, str(DEPLOY / "router.py"), "--zenoh-config", str(file), "--listen", endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            assert "listens on" in process.stdout.readline()
-            yield process
-        finally:
-            process.kill()
-
-
 def _all(edges: tuple[str, ...]) -> set[str]:
     return {EdgeKeys(edge).key(row) for edge in edges for row in (*WRITTEN, Channel.ALIVE)}
 
@@ -112,7 +97,7 @@ def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_po
     """Behind a router an edge cannot tell who asks: the router has to keep the rights, row by row, on each link."""
     endpoint = f"tls/127.0.0.1:{free_port}"
     with ExitStack() as stack:
-        stack.enter_context(_router(fleet.file("hub"), endpoint))
+        stack.enter_context(router("--zenoh-config", str(fleet.file("hub")), "--listen", endpoint))
 
         def opened(name: str, role: str) -> zenoh.Session:
             settings = fleet.settings(name, role, connect=(endpoint,))  # type: ignore[arg-type]
@@ -190,12 +175,12 @@ def test_a_router_says_who_is_not_named(fleet: Fleet, tmp_path: Path, free_port:
         file = tmp_path / "old.json5"
         file.write_text(old)
         with (
-            _router(file, endpoint) as router,
+            router("--zenoh-config", str(file), "--listen", endpoint) as running,
             open_session(fleet.settings("new-1", "edge", connect=(endpoint,))),
         ):
-            assert router.stderr is not None
+            assert running.stderr is not None
             lines: list[str] = []
-            stream = router.stderr
+            stream = running.stderr
             threading.Thread(target=lambda: lines.append(stream.readline()), daemon=True).start()
             eventually(lambda: lines, what="the router says it")
             assert (

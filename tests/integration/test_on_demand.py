@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,25 +20,6 @@ pytestmark = pytest.mark.integration
 
 PLACE = (300, 100, 200, 150)
 """x, y, width, height in source pixels."""
-
-
-@dataclass
-class Flight:
-    """What was asked of one flight, and what the flight says of itself."""
-
-    names: list[str]
-    box: RequestedStill
-    past: RequestedStill
-    track: RequestedStill
-    tracks: list[EdgeTrack]
-    refusals: list[str]
-    before_kbps: int
-    after_kbps: int
-    told: tuple[int, str, str]
-    nobody: tuple[int, str, str]
-    folder: Path
-    edge: dict[str, Any]
-    ground: dict[str, Any]
 
 
 def refusal(ask) -> str:
@@ -109,7 +89,7 @@ def two_seconds_ago(edge):
 
 
 @pytest.fixture(scope="module")
-def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
+def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """An edge in real time, a ground that records, and somebody who asks through the ground."""
     folder = tmp_path_factory.mktemp("asked")
     with Link(folder, name="asked") as link:
@@ -144,18 +124,18 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight
         told = held("still", *connect, "--box", "300,100,200,150", "--at", "-1s", *out)
         nobody = command("keyframe", *connect, "--edge", "uav-2")
         edge.stop()
-        return Flight(
-            names,
-            box,
-            past,
-            track,
-            tracks,
-            refusals,
-            before // 1000,
-            after // 1000,
-            told,
-            nobody,
-            folder,
+        return SimpleNamespace(
+            names=names,
+            box=box,
+            past=past,
+            track=track,
+            tracks=tracks,
+            refusals=refusals,
+            before_kbps=before // 1000,
+            after_kbps=after // 1000,
+            told=told,
+            nobody=nobody,
+            folder=folder,
             edge=edge.finish(),
             ground=ground.finish(),
         )

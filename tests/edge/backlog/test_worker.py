@@ -194,14 +194,20 @@ def test_the_words_of_a_full_line_are_few():
     assert intake.ended
 
 
-def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
-    """A put may block for seconds: what is seen meanwhile would not be kept."""
-    with opened(tmp_path / "store") as folder:
+def sending(path: Path) -> tuple[Link, StoreWorker]:
+    """A worker in the middle of its first chunk, on a link that is full."""
+    with opened(path) as folder:
         add_units(folder, UNITS)
     link = Link()
     link.full.clear()
-    worker = worker_of(tmp_path / "store", link)
+    worker = worker_of(path, link)
     assert link.entered.wait(60), "a chunk is being sent"
+    return link, worker
+
+
+def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
+    """A put may block for seconds: what is seen meanwhile would not be kept."""
+    link, worker = sending(tmp_path / "store")
     for unit in UNITS[:10]:
         worker.offer(shifted(unit, 50))
     eventually(lambda: worker.numbers.segments == 2 and worker.intake.idle, what="it is kept")
@@ -213,12 +219,7 @@ def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
 
 def test_after_the_last_word_nothing_goes_out(tmp_path):
     """The last report says how much there was: a ground that has it all would have closed its account already."""
-    with opened(tmp_path / "store") as folder:
-        add_units(folder, UNITS)
-    link = Link()
-    link.full.clear()
-    worker = worker_of(tmp_path / "store", link)
-    assert link.entered.wait(60), "a chunk is being sent"
+    link, worker = sending(tmp_path / "store")
     worker.send_no_more()
     link.full.set()
     for unit in UNITS[:10]:

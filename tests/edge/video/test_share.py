@@ -13,7 +13,7 @@ from hvt_edge.operating import FIRST_SHARE, Levers, Operating, Rates
 from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.video.reconfigure import EncoderReconfiguration, Split
-from rigs.examples import candidate
+from rigs.examples import candidate, decision_step
 
 SECOND = 1_000_000_000
 BOUNDS = {"size": (1280, 720), "nominal_fps": 15, "least_fps": 2, "edge_id": "e", "min_budget_bps": 50_000}
@@ -21,11 +21,9 @@ BOUNDS = {"size": (1280, 720), "nominal_fps": 15, "least_fps": 2, "edge_id": "e"
 
 def moment(seconds: float, *, from_source: bool = False) -> Step:
     """A decision step."""
-    return Step(
-        frame_index=round(seconds * 15),
+    return decision_step(
+        round(seconds * 15),
         now_ns=round(seconds * SECOND),
-        fps=15.0,
-        base_size=(1280, 720),
         cost=CostEstimate(150, 0.1, 700),
         allowance_bytes=2000,
         from_source=from_source,

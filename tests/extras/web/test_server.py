@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,6 +59,14 @@ def public(port) -> Iterator[int]:
     """A page that other machines reach."""
     with WebPage(f"0.0.0.0:{port}", clock=time.time_ns):
         yield port
+
+
+@pytest.fixture
+def keys(tmp_path) -> tuple[Path, Path]:
+    """Of a ground on loopback: its certificate and its key; the CA lies beside them."""
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    return key_pair(fleet.settings("base", "ground"))
 
 
 def test_a_server_that_ends_says_so(port, monkeypatch):
@@ -246,11 +255,8 @@ def test_elsewhere_nothing_is_shown_without_the_token(public, state_folder):
         assert json.loads(viewer.recv())["role"] == "viewer"
 
 
-def test_the_keys_of_the_link_encrypt_the_page(port, tmp_path, state_folder):
+def test_the_keys_of_the_link_encrypt_the_page(port, keys, tmp_path, state_folder):
     """Tokens and pictures would cross a network in clear, though there are keys."""
-    fleet = Fleet(tmp_path / "own")
-    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
-    keys = key_pair(fleet.settings("base", "ground"))
     trust = ssl.create_default_context(cafile=tmp_path / "own" / "ca.pem")
     with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=keys) as page:
         token = json.loads((state_folder / "web-tokens.json").read_text())["operator"]
@@ -443,12 +449,10 @@ def test_a_byte_now_and_then_holds_no_connection(port, monkeypatch):
             eventually(lambda one=one: is_closed(one), what="it is closed")
 
 
-def test_silent_connections_take_no_more_descriptors_than_others(port, tmp_path, monkeypatch):
+def test_silent_connections_take_no_more_descriptors_than_others(port, keys, monkeypatch):
     """Before TLS nobody counted them: recordings found no descriptor for their next file."""
     monkeypatch.setattr(server, "MOST_OPEN", 8)
-    fleet = Fleet(tmp_path / "own")
-    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
-    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=key_pair(fleet.settings("base", "ground"))):
+    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=keys):
         silent = [reached(port) for _ in range(40)]
         eventually(lambda: sum(map(is_closed, silent)) >= 32, what="most are closed")
         for one in silent:
@@ -495,12 +499,9 @@ def hung_up(viewer: ClientConnection) -> bool:
     return viewer.close_code is not None
 
 
-def test_who_begins_no_tls_is_closed(port, tmp_path, monkeypatch):
+def test_who_begins_no_tls_is_closed(port, keys, monkeypatch):
     """Its place would be taken for a minute, again and again."""
     monkeypatch.setattr(server, "REQUEST_S", 0.5)
-    fleet = Fleet(tmp_path / "own")
-    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
-    keys = key_pair(fleet.settings("base", "ground"))
     with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=keys), reached(port) as silent:
         eventually(lambda: is_closed(silent), what="it is closed")
 

@@ -11,8 +11,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -68,6 +68,20 @@ _ports = functools.cache(_Ports)
 def free_ports(number: int) -> list[int]:
     """TCP ports that nobody listens on at this moment, all different, and that no other test process picks."""
     return [_ports().free() for _ in range(number)]
+
+
+@contextmanager
+def router(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """``deploy/router.py``, listening."""
+    program = Path(__file__).resolve().parents[3] / "deploy" / "router.py"
+    command = [sys.executable, str(program), *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert "listens on" in process.stdout.readline()
+            yield process
+        finally:
+            process.kill()
 
 
 def answers(port: int) -> bool:

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Posterior, Tracks
 from hvt_edge.perception.candidates import Candidate
+from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.perception.stills.decode import Box
 from hvt_ground.perception.stills.match import StillSeen
@@ -24,6 +26,19 @@ class Clock:
     def __call__(self) -> int:
         """Now."""
         return self.now_ns
+
+
+def decision_step(frame_index: int = 300, **changes: Any) -> Step:
+    """At 15 frames a second, with plenty of room."""
+    fields: dict[str, Any] = {
+        "frame_index": frame_index,
+        "now_ns": round(frame_index / 15 * SECOND_NS),
+        "fps": 15.0,
+        "base_size": (1280, 720),
+        "cost": CostEstimate(),
+        "allowance_bytes": 1e9,
+    }
+    return Step(**(fields | changes))
 
 
 def detections(boxes: Any, confidences: Any = 0.9, classes: Any = 0) -> Detections:

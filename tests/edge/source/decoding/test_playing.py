@@ -17,7 +17,6 @@ from PIL import Image
 
 from hvt_common.errors import UserError
 from hvt_edge.source.decoding import container
-from hvt_edge.source.decoding.container import open_video
 from hvt_edge.source.opening import open_source
 from media.numbered import disc, number_of, numbered, patch, write_numbered
 
@@ -487,10 +486,3 @@ def test_black_and_frozen_pictures_are_told_of_once(tmp_path, caplog, level, say
         play(write_numbered(tmp_path / "a.mkv", pictures=pictures, rate=2), fps=2)
     assert caplog.text.count(f"its picture {says} for 10 s") == 1
     assert "alive again" in caplog.text
-
-
-def test_nothing_is_opened_where_there_is_no_film(tmp_path):
-    """A text would be played as a terminal's screen."""
-    (tmp_path / "a.txt").write_text("words\n" * 50)
-    with pytest.raises(UserError, match=r"holds no video|not a video"):
-        open_video(str(tmp_path / "a.txt"))

@@ -13,24 +13,16 @@ from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.stills.policy.m6 import ExpectedGain
 from hvt_edge.stills.policy.registry import METHODS, method
-from rigs.examples import candidate
+from rigs.examples import candidate, decision_step
 
 NOW = 20_000_000_000
 M6 = ExpectedGain()
 
 
 def step(**changes) -> Step:
-    """A decision step with plenty of room; a still costs 500 bytes of payload and 180 beside it."""
-    plain = Step(
-        frame_index=300,
-        now_ns=NOW,
-        fps=15.0,
-        base_size=(1280, 720),
-        cost=CostEstimate(500, 0, 500),
-        allowance_bytes=1e9,
-        still_overhead_bytes=180,
-    )
-    return replace(plain, **changes)
+    """A still costs 500 bytes of payload and 180 beside it."""
+    plain = {"cost": CostEstimate(500, 0, 500), "still_overhead_bytes": 180}
+    return decision_step(**(plain | changes))
 
 
 def car(track_id: int = 1, *, lost: float = 0.5, sharp: float = 500.0, **changes) -> Candidate:

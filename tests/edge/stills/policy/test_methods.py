@@ -12,27 +12,15 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.stills.policy.base import CostEstimate, CostModel, Step
+from hvt_edge.stills.policy.base import CostEstimate, CostModel
 from hvt_edge.stills.policy.paper import Small, Utility
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from rigs.examples import candidate
+from rigs.examples import decision_step as step
 
 SECOND = 1_000_000_000
 FPS = 15.0
 NAMES = st.sampled_from(["car", "van", "truck", "pedestrian", "tricycle", "moving"])
-
-
-def step(frame: int = 300, **changes) -> Step:
-    """A decision step with plenty of room."""
-    plain = Step(
-        frame_index=frame,
-        now_ns=round(frame / FPS * SECOND),
-        fps=FPS,
-        base_size=(1280, 720),
-        cost=CostEstimate(),
-        allowance_bytes=1e9,
-    )
-    return replace(plain, **changes)
 
 
 def car(track_id: int = 1, **changes) -> Candidate:

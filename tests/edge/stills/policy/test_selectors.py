@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.policy.selectors import SELECTORS, select
-from rigs.examples import candidate
+from rigs.examples import candidate, decision_step
 
 BY_NAME = {row.name: row for row in SELECTORS}
 AREA = 1280 * 720
@@ -146,9 +145,7 @@ def test_ties_keep_the_order_of_detection():
 
 def test_as_a_method_only_this_frame_s_detections_count():
     """A predicted box, of which no detector says that it is there, would be sent."""
-    moment = Step(
-        frame_index=5, now_ns=0, fps=15, base_size=(1280, 720), cost=CostEstimate(), allowance_bytes=1e9
-    )
+    moment = decision_step(5)
 
     def one(track_id, confidence, *, detected=True, side=40.0):
         box = (0.0, 0.0, side, side)
