@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
-from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.policy.registry import METHODS
 from hvt_edge.video.encoder import keyframe_floor_bytes
 
@@ -100,12 +99,6 @@ def test_a_share_that_does_not_count_is_said(argv, said):
     note = note_on_share(config, given=loaded.values)
     assert note.startswith(said)
     assert bool(note) == bool(said)
-
-
-def test_the_regimes_are_the_papers():
-    """Results would be compared with those of other budgets."""
-    rates = {name: (one.budget_bps, round(one.budget_bps * one.video_share)) for name, one in REGIMES.items()}
-    assert rates == {"low": (800_000, 650_000), "moderate": (1_400_000, 1_200_000)}
 
 
 @pytest.mark.parametrize("size", ["160x120", "320x180", "640x360", "1280x720", "1920x1080"])

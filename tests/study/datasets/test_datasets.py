@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import pickle
 import shutil
-from dataclasses import replace
 
 import av
 import cv2
 import numpy as np
 import pytest
 
-from hvt_common.config import load
 from hvt_common.errors import UserError
-from hvt_edge.config import EdgeConfig
-from hvt_edge.config import check as check_edge
-from hvt_ground.config import GroundConfig
-from hvt_ground.config import check as check_ground
 from hvt_scene import Scene
 from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.layouts.mot import mot_table, read_truth_rows
 from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.datasets.sequence import content_hash, stage_clip
-from hvt_study.flights.flight import FlightPlan, fly
-from hvt_study.flights.flight_ground import SharedModels
 from media.clips import smooth_pictures
 from media.numbered import number_of, write_numbered
-from rigs.flight import RedSquares
 from studies.layouts import SIZE, square_xywh, write_images, write_mot, write_uavdt, write_visdrone
 
 
@@ -502,25 +493,6 @@ def test_a_clip_is_staged_once(tmp_path):
     (tmp_path / "full" / "clip.bgr").symlink_to("/dev/full")
     assert stage_clip(sequence.clip, folder=tmp_path / "full") == sequence.clip
     assert list((tmp_path / "full").iterdir()) == []
-
-
-def test_a_dataset_flies(tmp_path):
-    """A sequence is for flying; labels and the ground's lists must be of one picture and in one space."""
-    write_visdrone(tmp_path, "a", count=60)
-    (sequence,) = open_dataset(f"visdrone:{tmp_path}")
-    flags = ["--source", str(tmp_path), "--pace", "lockstep", "--size", "160x96", "--detector", "motion"]
-    flags += ["--budget", "300kbps", "--preset", "ultrafast", "--method", "M0"]
-    edge, _ = load(EdgeConfig, flags, program="hvt-edge", description="")
-    ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
-    plan = FlightPlan(sequence.clip, check_edge(edge), ground, 300_000)
-    report = fly(plan, detector=RedSquares(), models=SharedModels(RedSquares()))
-    assert len(report.lists) == sequence.clip_frames == 30
-    frame_index = 20  # no jump in the last frames before it
-    shown, known = (
-        report.lists[frame_index].boxes_xyxy_px[0],
-        sequence.labels_at(frame_index).boxes_xyxy_px[0],
-    )
-    assert np.abs(shown - known).max() < 8
 
 
 def test_the_content_of_a_sequence(tmp_path):

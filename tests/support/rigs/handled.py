@@ -5,12 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_ground.perception.session import SessionPerception
-from hvt_ground.session.edge_port import ReceiverReports
+from hvt_ground.session.edge_port import EdgePort, ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Sink
@@ -57,7 +57,7 @@ class ReceiverRig:
         self.ended: list[Session] = []
         self._pipeline, self._worker_of = pipeline, worker_of
         self.receiver = EdgeSessions(
-            self.port, open_session=self._open, on_ended=self.ended.append, **settings
+            cast("EdgePort", self.port), open_session=self._open, on_ended=self.ended.append, **settings
         )
         self.receiver.start(drain_s=PATIENT_S)
 

@@ -178,24 +178,14 @@ def test_events_name_the_still_that_caused_a_refinement(recording: Recording, ev
 
 
 def test_nothing_undecodable_is_logged(units: list[tuple[bytes, bool]], tmp_path: Path) -> None:
-    """Rerun shows garbage for an access unit before the first keyframe, and restarts when time runs backwards."""
+    """Rerun shows garbage for what no decoder can start with, and restarts when time runs backwards."""
     path = tmp_path / "late.rrd"
     with Recorder(settings(path)) as recorder:
+        recorder.log(VideoSample(1, START_NS, units[1][0], keyframe=True))  # without parameter sets
         for index in [3, 4, 20, 21, 21, 20, 22]:
             recorder.log(VideoSample(index, START_NS + index * STEP_NS, *units[index]))
         recorder.log(VideoSample(23, START_NS + 23 * STEP_NS, b"", keyframe=False))
     assert [frame for frame, _, _ in Recording(path).video()] == [20, 21, 22]
-
-
-def test_a_keyframe_without_parameter_sets_does_not_begin_a_recording(
-    units: list[tuple[bytes, bool]], tmp_path: Path
-) -> None:
-    """No decoder can start there, whatever the flag says."""
-    path = tmp_path / "a.rrd"
-    with Recorder(settings(path)) as recorder:
-        recorder.log(VideoSample(1, START_NS, units[1][0], keyframe=True))
-        recorder.log(VideoSample(20, START_NS, *units[20]))
-    assert [frame for frame, _, _ in Recording(path).video()] == [20]
 
 
 def test_folding_changes_nothing_but_the_size(events: list[Event], tmp_path: Path) -> None:
