@@ -111,8 +111,9 @@ class FolderSource(Source):
     def _readable(self, place: int, *, held: Image) -> Image:
         image = _bgr(self._files[place], self._stretch, at_s=float(place * self._period_s))
         if image is None:
+            other = "first that can" if held is self._first else "one before"
             _log.warning(
-                "%s cannot be read as an image; the one before is shown in its place", self._files[place]
+                "%s cannot be read as an image; the %s is shown in its place", self._files[place], other
             )
         return held if image is None else image
 

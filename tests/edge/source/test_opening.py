@@ -241,6 +241,17 @@ def test_an_unreadable_image_is_held_over_and_shifts_nobody(tmp_path, caplog):
     assert [record.getMessage().count("cannot be read") for record in caplog.records] == [1, 1]
 
 
+def test_a_damaged_first_image_is_not_said_to_show_the_one_before(tmp_path, caplog):
+    """There is none: who looks for what is shown at the beginning would look for a picture that never was."""
+    (tmp_path / "1.png").write_bytes(b"no image")
+    cv2.imwrite(str(tmp_path / "2.png"), painted(50))
+    (tmp_path / "3.png").write_bytes(b"no image")
+    with open_source(str(tmp_path), size=(64, 64), fps=5) as source:
+        assert len(list(source.frames(start_ns=0))) == 3
+    assert "1.png cannot be read as an image; the first that can is shown in its place" in caplog.text
+    assert "3.png cannot be read as an image; the one before is shown in its place" in caplog.text
+
+
 def test_another_size_among_images_is_fitted_into_the_first_ones(tmp_path):
     """A sequence with one odd image would crash the encoder."""
     cv2.imwrite(str(tmp_path / "1.png"), painted(50, size=(200, 100)))
