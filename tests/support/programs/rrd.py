@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 import warnings
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +57,32 @@ def recorded(path: Path, events: Iterable[Event], **changes: Any) -> Path:
         for event in events:
             recorder.log(event)
     return path
+
+
+_LOGS = """
+import pickle, sys, time
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+settings, events = pickle.loads(Path(sys.argv[2]).read_bytes())
+{opens}
+for event in events:
+    sink.log(event)
+    print(event.frame_index, flush=True)
+    time.sleep(0.002)
+time.sleep(60)
+"""
+
+
+def killed(opens: str, settings: RecorderSettings, events: Sequence[Event], *, feed: Path, at: int) -> int:
+    """A process that logs the events into the ``sink`` that it ``opens`` is killed at a frame; its last one."""
+    feed.write_bytes(pickle.dumps((settings, events)))
+    words = [sys.executable, "-c", _LOGS.format(opens=opens), str(Path(__file__).parents[1]), str(feed)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        last = next((int(line) for line in process.stdout if int(line) >= at), -1)
+        process.kill()
+    assert last >= at, "it ended before"
+    return last
 
 
 def damaged(data: bytes, word: bytes, *, at: int = 0, by: bytes = b"\xff" * 40) -> bytes:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -422,43 +420,15 @@ def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, capl
 
 
 GROUND = """
-import pickle, sys, time
-from pathlib import Path
-sys.path.insert(0, {tests!r})
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import Limit
 from hvt_archive.index.folder import RecordingsFolder
 from hvt_archive.index.retention import Retention
 from hvt_ground.recordings.session_files import SessionFiles
-settings, events = pickle.loads(Path({feed!r}).read_bytes())
-index = RecordingsFolder(Path({folder!r}), Retention(*{retention}), failures=Failures(time.time_ns))
+index = RecordingsFolder(settings.path.parent, Retention(), failures=Failures(time.time_ns))
 index.begin()
 sink = SessionFiles(settings, split=Limit(seconds=2.0), tell=index.recorded)
-for event in events:
-    sink.log(event)
-    print(event.frame_index, flush=True)
-    time.sleep(0.002)
-time.sleep(60)
 """
-
-
-def killed(folder: Path, events: list[Event], *, at: int, retention: str = "()") -> None:
-    """A process that records them until it is killed at a frame."""
-    feed = folder.parent / "feed"
-    feed.write_bytes(pickle.dumps((settings(folder), events)))
-    script = GROUND.format(
-        tests=str(Path(__file__).parents[4] / "tests" / "support"),
-        feed=str(feed),
-        folder=str(folder),
-        retention=retention,
-    )
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if int(line) >= at:
-            break
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
 
 
 @pytest.mark.parametrize("at", [2, 30, *(pytest.param(at, marks=pytest.mark.nightly) for at in (29, 31, 45))])
@@ -466,7 +436,7 @@ def test_a_killed_ground_leaves_an_index_that_goes_on(tmp_path, events, at):
     """A power cut, and the index has to be mended by hand or tells less than there is."""
     folder = tmp_path / "flights"
     folder.mkdir()
-    killed(folder, events, at=at)
+    rrd.killed(GROUND, settings(folder), events, feed=tmp_path / "feed", at=at)
     rows = look(folder)
     assert [one.file for one in rows] == sorted(one.name for one in folder.glob("*.rrd"))
     assert all(one.whole for one in rows)

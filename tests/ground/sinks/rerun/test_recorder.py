@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import signal
 import subprocess
-import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +22,7 @@ from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, O
 from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS, Gallery, frame_of, placed
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
-from programs.rrd import Recording, recorded, settings
+from programs.rrd import Recording, killed, recorded, settings
 from rigs import examples
 
 SIZE = (320, 192)
@@ -250,40 +247,11 @@ def test_a_full_disk_is_one_sentence(events: list[Event]) -> None:
     assert Path("/dev/full").is_char_device(), "what was there before is not removed"
 
 
-KILLED = """
-import sys, pickle, time
-from pathlib import Path
-sys.path.insert(0, {tests!r})
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-events = pickle.loads(Path({feed!r}).read_bytes())
-recorder = Recorder(RecorderSettings(path=Path({out!r}), edge_id="k", session="1", base_size=(320, 192), fps=15.0,
-                                     budget_bps=4e5))
-for event in events:
-    recorder.log(event)
-    print(event.frame_index, flush=True)
-    time.sleep(0.002)
-time.sleep(60)
-"""
-
-
 def test_a_killed_process_leaves_all_that_was_logged(events: list[Event], tmp_path: Path) -> None:
     """A ground station's power goes when it likes."""
-    import pickle
-
-    feed, out = tmp_path / "feed", tmp_path / "killed.rrd"
-    feed.write_bytes(pickle.dumps(events))
-    script = KILLED.format(
-        tests=str(Path(__file__).parents[4] / "tests" / "support"), feed=str(feed), out=str(out)
-    )
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    last = -1
-    for line in process.stdout:
-        last = int(line)
-        if last >= 30:
-            break
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
+    out = tmp_path / "killed.rrd"
+    opens = "from hvt_ground.sinks.rerun.recorder import Recorder; sink = Recorder(settings)"
+    last = killed(opens, settings(out), events, feed=tmp_path / "feed", at=30)
     read = Recording(out)
     frames = [frame for frame, _, _ in read.video()]
     assert frames[: last + 1] == list(range(last + 1))
