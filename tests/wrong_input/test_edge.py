@@ -101,7 +101,7 @@ def test_a_value_that_is_not_accepted(edge, flag, value, accepted):
             (f"--encoder hevc_nvenc {regions}", ["--roi-depth 0.1 needs x265", "--encoder hevc_nvenc"])
             for regions in ("--roi-depth 0.1", "--method R0")
         ),
-        ("--method M5 --size 1280x720 --budget 60kbps", ["give at least 118 kbps, lower --size or --fps"]),
+        ("--method M5 --size 1280x720 --budget 60kbps", ["give at least 117 kbps, lower --size or --fps"]),
         ("--method M5 --size 1280x720 --budget 500kbps --video-share 0.1", ["or raise --video-share 0.1"]),
         ("--video-share 1e-320", ["leaves no base stream: give 0.01 to 1"]),
         *(

@@ -165,7 +165,7 @@ def test_the_edges_tracks_are_counted_and_shown(pace):
         assert (session.reception.steps, session.reception.ledger.messages(Account.META)) == (3, 3)
         assert session.reception.ledger.line_bytes == line_bytes(items)
         assert session.perceived.tracks == 2
-        assert session.pipeline.steps_used == 3
+        assert session.pipeline.counts.steps_used == 3
         assert session.pipeline.list_at(19).origins == ("edge+base", "edge")
 
 
@@ -179,7 +179,7 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         rig.put(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
         rig.settle()
         session = rig.receiver.session
-        assert (session.reception.steps, session.pipeline.steps_used) == (2, 1)
+        assert (session.reception.steps, session.pipeline.counts.steps_used) == (2, 1)
         assert rig.receiver.receiver.unusable == 3
         rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
         rig.settle()
