@@ -22,6 +22,8 @@ from hvt_common.runtime.log import STATUS_LOGGER
 from hvt_common.units import shown_text
 
 _PLAIN_EVERY = 5
+_MOST_NAME_BYTES = 190
+"""File systems take 255. The files of further sessions, parts and backlogs have up to 64 more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +130,11 @@ def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) 
     if not path.absolute().parent.is_dir():
         raise NotYetError(  # it may be of a disk that is mounted later
             f"{name} {path} is in a folder that does not exist: make {path.absolute().parent} first"
+        )
+    if len(os.fsencode(path.name)) > _MOST_NAME_BYTES:
+        raise UserError(
+            f"{name} {path} has a name of {len(os.fsencode(path.name))} bytes: give one of at most "
+            f"{_MOST_NAME_BYTES}, because the names of further files begin with it"
         )
     if path.exists() and not path.is_file():  # /dev/stdout or a pipe: opening it to see may block
         return

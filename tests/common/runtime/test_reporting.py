@@ -41,10 +41,12 @@ def test_a_summary_can_go_into_a_pipe(tmp_path):
 def test_files_that_cannot_be_written_are_refused_before_the_run(tmp_path):
     """The numbers of an hour's flight would be lost at its end."""
     check_writable(None, name="--summary")
-    check_writable(tmp_path / "new.json", name="--summary")
+    check_writable(tmp_path / f"{'new' * 61}12.json", name="--summary")
     for path, said in (
         (tmp_path, "is a folder: name a file"),
         (tmp_path / "none" / "s.json", "is in a folder that does not exist: make "),
+        # The file of a second session, with the edge's id behind it, could not be written.
+        (tmp_path / f"{'é' * 93}.json", "has a name of 191 bytes: give one of at most 190, "),
     ):
         with pytest.raises(UserError, match=said):
             check_writable(path, name="--summary")
