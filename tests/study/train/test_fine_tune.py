@@ -93,7 +93,7 @@ def test_a_network_learns_what_it_never_knew(tmp_path):
 
     def found(path):
         """Share of labels that a box of the class lies on, however low its calibrated score."""
-        detector = open_detector(str(path), confidence=0.001)
+        detector = open_detector(str(path), confidence=1e-9)
         hits = []
         for one in kept:
             seen = detector.detect(one.image_bgr)
