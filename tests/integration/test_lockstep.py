@@ -97,7 +97,7 @@ def test_the_same_input_gives_the_same_base_stream(plays):
 def test_the_same_input_gives_the_same_stills(plays):
     """A method that is a little better would look a little worse on the next run."""
     one, two, _ = plays
-    assert one.edge["stills"]["sent"] == len(one.stills) > 10
+    assert one.edge["stills"]["sent"] == len(one.stills) > 5
     assert one.stills == two.stills
 
 
