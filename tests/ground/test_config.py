@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import fcntl
 import os
 from pathlib import Path
 
@@ -165,6 +166,16 @@ def test_on_a_full_disk_it_keeps_what_it_wrote_too(tmp_path, monkeypatch):
     (tmp_path / "f.rrd").write_text("flight")
     set_aside(read("--record", str(tmp_path / "f.rrd")))
     assert [one.read_text() for one in tmp_path.glob("earlier-*-f.rrd")] == ["flight"]
+
+
+def test_nothing_is_moved_from_under_a_ground_that_still_records(tmp_path):
+    """A second one that is started by mistake would end the recording of the first."""
+    for one in ("f.rrd", "t.csv"):
+        (tmp_path / one).write_text(one)
+    with (tmp_path / "f.rrd").open() as recording:
+        fcntl.flock(recording, fcntl.LOCK_EX)
+        set_aside(read("--record", str(tmp_path / "f.rrd"), "--tracks", str(tmp_path / "t.csv")))
+    assert {one.name for one in tmp_path.iterdir()} == {"f.rrd", "t.csv"}
 
 
 def test_two_grounds_of_one_folder_never_get_one_name(tmp_path):

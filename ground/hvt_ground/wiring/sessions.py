@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import threading
 import time
@@ -75,8 +76,11 @@ def make_folders(config: GroundConfig) -> None:
 def set_aside(config: GroundConfig) -> None:
     """Move what an earlier run wrote into the named files of this one to a folder ``earlier-<time>`` beside them.
 
-    A supervisor starts a ground that died again with the same names, and a flight cannot be received twice.
+    A supervisor starts a ground that died again with the same names, and a flight cannot be received twice. Nothing
+    is moved from under another ground that still writes its recording there.
     """
+    if any(suffix == ".rrd" and path.is_file() and _is_written(path) for _, path, suffix in written(config)):
+        return
     stamp = time.strftime("%Y%m%d-%H%M%S")
     for name, path, suffix in written(config):
         file = path.resolve()
@@ -99,6 +103,17 @@ def set_aside(config: GroundConfig) -> None:
             _log.warning("%s %s is written over: it cannot be moved (%s)", name, path, error.strerror)
         else:
             _log.warning("%s %s was there already: it is %s now", name, path, into + file.name)
+
+
+def _is_written(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        pass
+    return False
 
 
 def is_file(path: Path, suffix: str) -> bool:
