@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import threading
 import time
@@ -35,6 +34,7 @@ from hvt_ground.sinks.event_tables import SessionTiming, StillFiles, TrackTable,
 from hvt_ground.sinks.line_file import claim_name, has_nothing
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.rrd_file import locked
 
 _log = logging.getLogger(__name__)
 
@@ -108,12 +108,9 @@ def set_aside(config: GroundConfig) -> None:
 def _is_written(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # a file system without locks
-        pass
-    return False
+            return not locked(file.fileno())
+    except OSError:
+        return False
 
 
 def is_file(path: Path, suffix: str) -> bool:

@@ -213,7 +213,7 @@ def _created(path: Path) -> int:
         with telling(f"recording {path} cannot be created: "):
             file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
         # Whoever looks through the folder removes empty files that nobody has locked: this one perhaps, just now.
-        if _locked(file) and os.fstat(file).st_nlink:
+        if locked(file) and os.fstat(file).st_nlink:
             if os.fstat(file).st_size:
                 os.ftruncate(file, 0)  # not before: another ground may be writing it
             return file
@@ -222,7 +222,8 @@ def _created(path: Path) -> int:
     raise UserError(f"recording {path} cannot be created: another program is at work on it")
 
 
-def _locked(file: int) -> bool:
+def locked(file: int) -> bool:
+    """Whether a descriptor holds the lock of its file now; another program may, as long as it writes a recording."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
