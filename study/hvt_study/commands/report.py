@@ -24,7 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "write there, with one results.parquet of all; needed where there are several (default: DIR itself)"
     )
     option(parser, "--out", required=False, help=there)
-    option(parser, "--accounting")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -36,6 +35,6 @@ def run(arguments: argparse.Namespace) -> int:
             f"{len(arguments.folders)} studies are given, and no place for the one: add --out DIR"
         )
     where = arguments.folders[0] if out is None else out
-    write_report(where, accounting=getattr(arguments, "accounting", None))
+    write_report(where)
     say(str(where / "report.html"))
     return 0
