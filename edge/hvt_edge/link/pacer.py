@@ -26,7 +26,7 @@ _MOST_BACKLOG_NS = 250 * _MS
 _STILL_BACKLOG_NS = 50 * _MS
 """A still goes when what was sent before it has (nearly) left: the next base frame finds the link free."""
 _SLACK_NS = 75 * _MS
-_LEAST_HELD_NS, _FIRST_HELD_NS, _MOST_HELD_NS = 50 * _MS, 150 * _MS, 300 * _MS
+_LEAST_HELD_NS, _FIRST_HELD_NS, _MOST_HELD_NS = 50 * _MS, 150 * _MS, 500 * _MS
 _NO_NEWS_NS = 250 * _MS
 """Where the link loses messages and reports name none for so long, a keyframe asks whether those overdue are lost."""
 _PROBES_NS = 1500 * _MS
@@ -350,10 +350,9 @@ class Pacer:
             silent = self._reported_ns is not None and now_ns - self._reported_ns > _SILENCE_NS
             self._reported_ns = now_ns
             self._note_losses(feedback, now_ns)
+            oldest = self._flight.oldest
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
-            if (
-                silent
-            ):  # at the least rate, what else was sent would be waited for longer than for what is lost
+            if silent:  # at the least rate the rest would be waited for longer than for what is lost
                 self._flight.clear()
             return_ns = now_ns - feedback.send_ns
             if sent is None or (
@@ -361,7 +360,10 @@ class Pacer:
             ):
                 return
             held_ns = 1000 * feedback.base_held_us
-            self._note_times(sent, held_ns, return_ns, now_ns)
+            # The oldest that it names has waited for a report since the one before.
+            self._note_times(
+                sent, held_ns + max(0, sent.sent_ns - (oldest or sent).sent_ns), return_ns, now_ns
+            )
             backoffs = self.backoffs
             self._controller.on_progress(
                 Progress(
@@ -481,7 +483,7 @@ class Pacer:
 
     @property
     def _slack_ns(self) -> int:
-        return _SLACK_NS + 5 * self._held_ns // 4
+        return _SLACK_NS + self._held_ns
 
     def _overdue_ns(self, now_ns: int) -> int:
         oldest = self._flight.oldest
