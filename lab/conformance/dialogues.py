@@ -19,8 +19,14 @@ from rigs.messages import BACKLOG, BASE, INFO, ROI
 _SESSION = 2**63 + 9
 _SOURCE = (4000, 3000)
 _DATA = bytes(range(40))
+_OBJECTS = {
+    7: (_SESSION, BacklogKind.STILL, 7),
+    8: (_SESSION, BacklogKind.STILL, 8),
+    17: (_SESSION + 1, BacklogKind.STILL, 7),
+    27: (_SESSION, BacklogKind.BASE, 7),
+}
 _Chunk = tuple[int, int, int, int]
-"""Number, offset, end, total."""
+"""Which of the objects, offset, end, total."""
 _Event = _Chunk | bool
 """Or whether the object that was completed last is usable."""
 _DIALOGUES: tuple[tuple[str, tuple[_Event, ...]], ...] = (
@@ -37,6 +43,7 @@ _DIALOGUES: tuple[tuple[str, tuple[_Event, ...]], ...] = (
     ("the total changes", ((7, 0, 20, 40), (7, 20, 25, 30), (7, 0, 30, 30), True)),
     ("the total changes after the end", ((7, 0, 30, 30), True, (7, 0, 20, 40), (7, 20, 40, 40), True)),
     ("two objects in turn", ((7, 0, 20, 40), (8, 0, 10, 10), True, (7, 20, 40, 40), True)),
+    ("three of one number", ((7, 0, 20, 40), (17, 0, 10, 40), (27, 0, 15, 40), (7, 20, 40, 40), True)),
     (
         "no bytes, and too many",
         ((7, 0, 20, 40), (7, 20, 20, 40), (7, 20, 40, 39), (7, 20, 40, 40), True),
@@ -179,10 +186,11 @@ def backlog_dialogues() -> Iterator[dict[str, Any]]:
                 assembly.settle(whole, usable=event)
                 steps.append({"usable": event})
             else:
-                number, start, end, total = event
+                which, start, end, total = event
+                session_id, kind, number = _OBJECTS[which]
                 header = BacklogHeader(
-                    session_id=_SESSION,
-                    kind=BacklogKind.STILL,
+                    session_id=session_id,
+                    kind=kind,
                     number=number,
                     offset=start,
                     total_bytes=total,

@@ -274,9 +274,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("the median of none is not 0", ">> 1] : 0", ">> 1] : 1"),
     Mutant("a number may be of any length", "need(length < 33,", "need(length < 34,"),
     Mutant("bytes may be left over", "need(this.next >= this.data.length,", "need(true,"),
-    Mutant(
-        "a step may end a byte early", "this.next - this.data.length < 4", "this.next - this.data.length < 5"
-    ),
+    Mutant("a step may end a byte early", "this.data.length < 4", "this.data.length < 5"),
     Mutant("a step may end early", "this.next - this.data.length < 4", "this.next - this.data.length < 400"),
     Mutant(
         "places have no bound", "held(-524272, 524272), held(1, 524272)", "held(-1e12, 1e12), held(1, 524272)"
@@ -286,11 +284,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("speed has no bound", "held(-(2 ** 24), 2 ** 24)", "held(-1e15, 1e15)"),
     Mutant("confidence has no bound", "held(0, 15)", "held(-100, 100)"),
     Mutant("shifts round to zero", "Math.floor(value / 2 ** places)", "Math.trunc(value / 2 ** places)"),
-    Mutant(
-        "velocity rounds to zero",
-        "track.vx = fast(old.vx + Math.floor(",
-        "track.vx = fast(old.vx + Math.trunc(",
-    ),
+    Mutant("velocity rounds to zero", "fast(old.vx + Math.floor(", "fast(old.vx + Math.trunc("),
     Mutant("of two in the middle the upper counts", "[(values.length - 1) >> 1]", "[values.length >> 1]"),
     Mutant("missed tracks count for the median", "track.missed === 0);", "track.missed >= 0);"),
     Mutant("a class may be 2048", "found < SCHEMA.limits.classes", "found <= SCHEMA.limits.classes"),
@@ -334,6 +328,8 @@ MUTANTS: tuple[Mutant, ...] = (
         "if (coding !== 1 ||",
         'if (frame <= this.frame && sequence > this.sequence) return "damaged";\n        if (coding !== 1 ||',
     ),
+    Mutant("steps go on over sessions", 'of("session_id") !== this.session', "false"),
+    Mutant("frames go on over sessions", '[of("session_id"), -1, -1]', '[of("session_id"), -1, this.frame]'),
     Mutant("a step may stand still", "need(frame > this.frame,", "need(frame >= this.frame,"),
     Mutant("a step is not sorted", "return found.sort((a, b) => a.id - b.id);", "return found;"),
     # Poses
@@ -347,6 +343,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a pose's numbers have no bounds", "value >= kinds[index][0] && value <= kinds[index][1]", "true"),
     Mutant("a roll may be half a turn", "[-1800, 1799, 12, 3, true]", "[-1800, 1800, 12, 3, true]"),
     Mutant("a pose may have a byte behind it", "rest.length < 8", "rest.length < 9"),
+    Mutant("poses go on over sessions", "values[0] !== this.session", "false"),
     Mutant("a pose may go back in time", "time > this.time && ", ""),
     Mutant("a pose's number does not begin again at 16", "(this.number + 1) % 16", "this.number + 1"),
     # Where a still is
@@ -394,6 +391,8 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("what was written is of any size", "if (this.done.get(key) === total)", "if (this.done.has(key))"),
     Mutant("an unusable object counts", "usable ? total : 0", "total"),
     Mutant("objects are one", '["session_id", "kind", "number"].map', '["session_id", "kind"].map'),
+    Mutant("objects have no session", '["session_id", "kind", "number"].map', '["kind", "number"].map'),
+    Mutant("objects have no kind", '["session_id", "kind", "number"].map', '["session_id", "number"].map'),
     Mutant("a crop may end right of the source", "x + width <= source[0] && ", ""),
     Mutant("a crop may end below the source", " && y + height <= source[1]", ""),
     Mutant("a still may be wider than its crop", "w <= width && h <= height", "h <= height"),

@@ -433,14 +433,14 @@ function readTracks(data: Uint8Array, before: Track[], frames: number, alone: bo
 
 class TrackReader {
   tracks: Track[] = [];
-  private sequence = -1;
-  private frame = -1;
+  private session: Value = null; private sequence = -1; private frame = -1;
 
   // "read", "skipped" where it builds on a step that never came or is not newer, "damaged".
   take(data: Uint8Array): string {
     const values = read("TrackStep", data, new Uint8Array());
     const of = (name: string): Value => field("TrackStep", values, name);
     const [sequence, frame, reference, coding] = [of("sequence"), of("frame_index"), of("reference"), of("coding")].map(Number);
+    if (of("session_id") !== this.session) [this.session, this.sequence, this.frame] = [of("session_id"), -1, -1];
     if (coding !== 1 || sequence <= this.sequence || (reference !== -1 && reference !== this.sequence)) return "skipped";
     try {
       need(frame > this.frame, "it does not lie ahead");
@@ -500,8 +500,7 @@ const wrapped = (value: number, [from, to]: Numbered): number => {
 };
 
 class PoseReader {
-  private number = -1;
-  private time = 0;
+  private session: Value = null; private number = -1; private time = 0;
   private step = [0, 0];
   private groups: Record<string, number[] | null> | undefined;
 
@@ -509,6 +508,7 @@ class PoseReader {
   take(data: Uint8Array): unknown {
     try {
       const values = read("PoseReport", data, new Uint8Array());
+      if (values[0] !== this.session) [this.session, this.groups] = [values[0], undefined];
       if (field("PoseReport", values, "coding") !== 1n) return "skipped";
       return this.decode(new Bits(field("PoseReport", values, "coded") as Uint8Array));
     } catch (error) {

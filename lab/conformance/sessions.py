@@ -42,6 +42,7 @@ def track_steps() -> Iterator[dict[str, Any]]:
     """Sessions of steps, each with the list that it leaves; damaged ones leave that of the step before."""
     for name, count, steps in (("three cars", 3, 8), ("a crowd", 60, 6), ("nobody", 0, 3)):
         yield {"session": name, "steps": list(_session(count, steps))}
+    yield {"session": "the edge starts again", "steps": [*_session(3, 3), *_session(3, 2, session_id=7)]}
     yield {"session": "damaged steps", "steps": list(_damaged())}
     for name, script in track_sessions():
         yield {"session": name, "steps": list(_scripted(script))}
@@ -73,8 +74,8 @@ def _scripted(script: list[Step]) -> Iterator[dict[str, Any]]:
         yield found | ({"tracks": _rows(state)} if len(state) < _LONG else {"count": len(state)})
 
 
-def _session(count: int, steps: int) -> Iterator[dict[str, Any]]:
-    encoder = TrackStepEncoder(session_id=2**63 + 5, refresh_ns=1_500_000_000)
+def _session(count: int, steps: int, *, session_id: int = 2**63 + 5) -> Iterator[dict[str, Any]]:
+    encoder = TrackStepEncoder(session_id=session_id, refresh_ns=1_500_000_000)
     state: list[CodedTrack] = []
     frame = -1
     for number in range(steps):
@@ -181,6 +182,8 @@ def poses() -> Iterator[dict[str, Any]]:
     other = replace(reports[1], coding=2)
     holes = [reports[1], reports[0], *damaged, other, reports[1], reports[1], *reports[3:]]
     yield {"session": "holes, damage, and one that stands by itself", "reports": list(_read_poses(holes))}
+    again = [replace(one, session=8) for one in (reports[1], reports[0], reports[1])]
+    yield {"session": "the edge starts again", "reports": list(_read_poses([reports[0], *again]))}
     for name, scripts in _pose_scripts().items():
         made = [PoseReport(session=9, send_ns=7, coded=one.ended(stop="")) for one in scripts]
         yield {"session": name, "reports": list(_read_poses(made))}
@@ -231,8 +234,10 @@ def _pose_scripts() -> dict[str, list[BitWriter]]:
 
 
 def _read_poses(reports: list[PoseReport]) -> Iterator[dict[str, Any]]:
-    decoder = PoseDecoder()
+    decoder, session = PoseDecoder(), reports[0].session
     for report in reports:
+        if report.session != session:
+            decoder, session = PoseDecoder(), report.session
         found: dict[str, Any] = {"hex": report.pack().hex()}
         if report.coding != 1:
             yield found | {"skipped": True}
