@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,12 +14,11 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of
 from hvt_common.inference.heads.choose import HEAD_NAMES, Trial, check_head_name, choose_head, trial_pictures
-from hvt_common.inference.heads.contract import Head
 from hvt_common.inference.labels import (
-    KNOWN_LABELS,
     USUAL_CONFIDENCE,
     class_labels,
     default_confidence,
+    detector_labels,
     read_labels,
 )
 from hvt_common.inference.letterbox import Letterboxer, Preparation, as_bgr, prepared_as
@@ -38,8 +36,6 @@ _CELLS = (_CELL, 64, 128)
 _TRIAL_CELLS = (9, 7)
 """Odd: a network of a larger stride than assumed shows it."""
 _USUAL_SIDE = 640
-_UNNAMED = 100
-"""Classes that get a number for a name where a list of objects without names does not tell how many there are."""
 _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
 _OURS = "hvt.training_commit"
@@ -203,7 +199,13 @@ class OnnxDetector:
         assert dtype is not None
         if dtype == np.uint8:  # it scales the pixels itself
             self.preparation = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=self.preparation.rgb)
-        self.class_names = _class_names(model, self.head, names, labels)
+        said_by = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"
+        self.class_names = detector_labels(
+            *(model.path, names, said_by),
+            head=self.head.name,
+            classes=self.head.classes,
+            inputs=len(model.inputs),
+        )
         self._group_ids = _group_ids(self.class_names)
         self._beyond_said = False
         self._letterboxer = Letterboxer(
@@ -407,27 +409,4 @@ def _not_a_detector(model: OnnxModel, why: str, *, channels_last: bool = False) 
     return (
         f"model {model.path} is not a detector that is known here: {why}"
         f" (input: {inputs}; outputs: {outputs}; accepted heads: {', '.join(HEAD_NAMES)})"
-    )
-
-
-def _class_names(
-    model: OnnxModel, head: Head, names: tuple[str, ...] | None, labels: Path | None
-) -> tuple[str, ...]:
-    origin = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"
-    if names is None:
-        count = head.classes or _UNNAMED
-        _say_unnamed(model.path, count)
-        return tuple(f"class {index}" for index in range(count))
-    if head.classes is not None and len(names) != head.classes:
-        raise UserError(f"{origin} has {len(names)} class names; {model.path} has {head.classes} classes")
-    return names
-
-
-@cache  # once of a file: one that fails in flight is opened again and again
-def _say_unnamed(path: Path, count: int) -> None:
-    _log.warning(
-        "%s has no class names: its classes are class 0 to class %d; --labels FILE names them (or --labels %s)",
-        path.name,
-        count - 1,
-        ", ".join(KNOWN_LABELS),
     )

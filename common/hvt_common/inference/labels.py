@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 import json
+import logging
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from hvt_common.errors import UserError, absent
@@ -18,22 +20,35 @@ from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, known_classes, parts_of, resolve_model
 from hvt_common.units import shown_text
 
+_log = logging.getLogger(__name__)
+
 KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": VISDRONE_NAMES}
 """Names that stand for a file. A number of classes alone never means one of these."""
+
+_NO_COCO_ID = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
+_FIRST_COCO_ID = {"tf-lists": 1, "labels-boxes-scores": 0, "ssd": 0}
+"""Of heads that list objects by COCO's own ids, as TensorFlow, torchvision and the Open Model Zoo do."""
+_FIRST_COCO_ID_OF = {90: 1, 91: 0}
+"""By the number of classes."""
+_UNNAMED = 100
+"""Classes that get a number for a name where a list of objects without names does not tell how many there are."""
 
 MAX_LABELS = 100_000
 MAX_LABEL_CHARS = 200
 _MAX_METADATA_CHARS = 1 << 20
 _NAME = re.compile(r"[\w .&'/+-]*[^\W\d_][\w .&'/+-]*")
 """Between commas or line ends, without brackets around."""
+_NUMBERED = re.compile(r"(\d+)\s*[:=,;.)\s]\s*(\S.*)")
+_SYNSET = re.compile(r"n\d{8}\s+")
+_OF_TABLE = re.compile(r"[\[\]{}]|:$|^names\s*:")
 
 
 def read_labels(path: Path) -> tuple[str, ...]:
     """Read class names: UTF-8 text, one name a line, the first line is class 0; or one of `KNOWN_LABELS`.
 
-    Blank lines at the end are ignored; spaces around a name too. A name may occur twice (ImageNet has two
-    cranes). Raises `UserError` where it is missing, not readable, not text, or empty, has a blank line in the
-    middle, or too many or too long names.
+    Blank lines at the end are ignored; spaces around a name too, and what numbers every line: 0 or 1 and so on, or a
+    synset of ImageNet. A name may occur twice (ImageNet has two cranes). Raises `UserError` where it is missing, not
+    readable, not text, empty or a table, has a blank line in the middle, or too many or too long names.
     """
     if str(path) in KNOWN_LABELS and not path.exists():
         return KNOWN_LABELS[str(path)]
@@ -55,7 +70,22 @@ def read_labels(path: Path) -> tuple[str, ...]:
             raise UserError(
                 f"labels file {path} is not text in line {number}; one class name a line is expected"
             )
-    return tuple(names)
+        if _OF_TABLE.search(name):
+            raise UserError(
+                f"labels file {path} has {name!r:.80} in line {number}; one class name a line is expected, no table"
+            )
+    return _without_numbers(names)
+
+
+def _without_numbers(names: Sequence[str]) -> tuple[str, ...]:
+    # ``0 car``, ``1: bus`` or ``n02084071 dog``; what stands before all names is none of theirs.
+    if all(map(_SYNSET.match, names)):
+        return tuple(_SYNSET.sub("", name) for name in names)
+    found = [_NUMBERED.fullmatch(name) for name in names]
+    numbers = [int(one[1]) for one in found if one]
+    if len(names) < 2 or numbers not in (list(range(len(names))), list(range(1, len(names) + 1))):
+        return tuple(names)
+    return tuple(one[2] for one in found if one)
 
 
 def class_labels(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...] | None:
@@ -65,6 +95,42 @@ def class_labels(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...] | N
         return own
     known = known_classes(path)
     return KNOWN_LABELS.get(known.partition(",")[0].lower()) or _written_names(known)
+
+
+def detector_labels(
+    path: Path, names: tuple[str, ...] | None, said_by: str, *, head: str, classes: int | None, inputs: int
+) -> tuple[str, ...]:
+    """The names of a detector's classes: those that are known, ``said_by`` a file, or numbers, which is said.
+
+    COCO's 80 are in a row, or have COCO's own ids, by the number of classes, else by the head of a network with so
+    many inputs. Raises `UserError` where there are not as many as classes.
+    """
+    if names is None:
+        count = classes or _UNNAMED
+        _say_unnamed(path, count)
+        return tuple(f"class {index}" for index in range(count))
+    if names is COCO_NAMES and said_by.startswith("labels"):
+        by_head = _FIRST_COCO_ID.get(head) if inputs == 1 else None
+        first = by_head if classes is None else _FIRST_COCO_ID_OF.get(classes)
+        names = names if first is None else _coco_names_by_id()[first:]
+    if classes is not None and len(names) != classes:
+        raise UserError(f"{said_by} has {len(names)} class names; {path} has {classes} classes")
+    return names
+
+
+def _coco_names_by_id() -> tuple[str, ...]:
+    names = iter(COCO_NAMES)
+    return tuple(f"class {number}" if number in _NO_COCO_ID else next(names) for number in range(91))
+
+
+@cache  # once of a file: one that fails in flight is opened again and again
+def _say_unnamed(path: Path, count: int) -> None:
+    _log.warning(
+        "%s has no class names: its classes are class 0 to class %d; --labels FILE names them (or --labels %s)",
+        path.name,
+        count - 1,
+        ", ".join(KNOWN_LABELS),
+    )
 
 
 def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
@@ -105,6 +171,7 @@ def _written_names(text: str) -> tuple[str, ...] | None:
         return None
     if text[0] not in "[{(":
         names = [name.strip() for name in re.split(r"[,\n]", text) if name.strip()]
+        names = list(_without_numbers(names))
         return _names(names) if all(map(_NAME.fullmatch, names)) else None
     for read in (ast.literal_eval, json.loads, _unquoted):
         # Not a literal; or a key that is a list, or a number that is too long to print.
@@ -130,6 +197,8 @@ def _names(value: object) -> tuple[str, ...] | None:
             return None
         value = numbered_names(numbers)
     if not isinstance(value, list | tuple) or not 0 < len(value) <= MAX_LABELS:
+        return None
+    if any(isinstance(item, dict | list | tuple) for item in value):
         return None
     # What no terminal, table or message can hold is ``?``.
     plain = (shown_text(str(item)[:MAX_LABEL_CHARS]).replace("\n", "?") for item in value)

@@ -27,9 +27,33 @@ def test_one_name_a_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("content", "names"),
+    [
+        ("0 car\n1 bus", ("car", "bus")),
+        ("1: car\n2: traffic light", ("car", "traffic light")),
+        ("0,car\n1,bus", ("car", "bus")),
+        ("n02084071 dog, domestic dog\nn02958343 car", ("dog, domestic dog", "car")),
+        ("2 wheeler\n4 wheeler", ("2 wheeler", "4 wheeler")),
+        ("1 tonner", ("1 tonner",)),
+    ],
+)
+def test_a_number_before_each_name_is_none_of_it(
+    tmp_path: Path, content: str, names: tuple[str, ...]
+) -> None:
+    """No kind would be known: "2 car" is no car, and "n02958343 car" is nothing."""
+    path = tmp_path / "labels.txt"
+    path.write_text(content)
+    assert read_labels(path) == names
+
+
+@pytest.mark.parametrize(
     ("content", "words"),
     [
         (b"", "empty"),
+        (b"path: .\nnames:\n  0: car\n", "'names:' in line 2; .*, no table"),
+        (b"names: car\n", "in line 1; .*, no table"),
+        (b'["car", "bus"]', "in line 1; .*, no table"),
+        (b"item {\n  id: 1\n}\n", "in line 1; .*, no table"),
         (b" \n\n", "empty"),
         (b"car\n\nbus\n", "no name in line 2"),
         (b"car\n" + b"x" * 201, "201 characters in line 2"),
@@ -79,6 +103,8 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
         ({"names": "{0: small car, 1: bus}"}, ("small car", "bus")),
         ({"classes": '{"bus": 1, "car": 0}'}, ("car", "bus")),
         ({"names": '{"nc": 2}'}, None),
+        ({"names": "[{'id': 0, 'name': 'car'}]"}, None),
+        ({"names": "0: car\n1: bus"}, ("car", "bus")),
         ({"names": r"{0: 'a\ud800', 1: 'b\nc', 2: ''}"}, ("a?", "b?c", "class 2")),
     ],
 )
