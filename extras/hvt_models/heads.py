@@ -224,7 +224,13 @@ def _yolo_nas(trial: Trial) -> Match | None:
         not _is_listed(trial, pair[0]) and _are_corners(_shown(boxes)) and not trial.relative(boxes)
     )
     proof = "boxes x1 y1 x2 y2 and scores, a row a cell" if a_row_a_cell else None
-    return Match(pair, trial.shape(pair[1])[2], PerQuery("corners"), proof)
+    scores_first = pair[1] < pair[0]  # DAMO-YOLO's, of pixels up to 255, and MMYOLO's
+    return Match(
+        pair,
+        trial.shape(pair[1])[2],
+        PerQuery("corners"),
+        _if_pixels_are(trial, proof, usual=not scores_first),
+    )
 
 
 def _rt_detr(trial: Trial) -> Match | None:
@@ -263,8 +269,9 @@ def _nms_lists(trial: Trial) -> Match | None:
     lists = _lists(trial, leave=count)
     if count is None or lists is None or "detection_boxes" in trial.ports[lists[0]].name:
         return None
-    proof = "a count, boxes, scores and classes"
-    return Match((*lists, count), None, Parallel(), proof if _are_corners_or_none(trial, lists[0]) else None)
+    proof = "a count, boxes, scores and classes" if _are_corners_or_none(trial, lists[0]) else None
+    mmyolo = trial.named("num_dets", "boxes", "scores", "labels") == (count, *lists)  # RTMDet as YOLOv5
+    return Match((*lists, count), None, Parallel(), _if_pixels_are(trial, proof, usual=not mmyolo))
 
 
 def _labels_boxes_scores(trial: Trial) -> Match | None:
@@ -273,7 +280,9 @@ def _labels_boxes_scores(trial: Trial) -> Match | None:
         return None
     said = "boxes, scores and classes (torchvision counts them from 1: its class 0 is the background)"
     proof = said if _are_corners_or_none(trial, lists[0]) else None
-    return Match(lists, None, Parallel(), proof)
+    # Those of SSD (ImageNet's means) and Custom Vision (0…255) are shares of the input, or called detected.
+    others = trial.relative(trial.table(lists[0])) or "detected" in trial.ports[lists[0]].name.lower()
+    return Match(lists, None, Parallel(), _if_pixels_are(trial, proof, usual=not others))
 
 
 def _tf_lists(trial: Trial) -> Match | None:
@@ -295,12 +304,14 @@ def _atss(trial: Trial) -> Match | None:
     table = trial.table(boxes)
     if not are_probabilities(table[:, 4]) or not _are_corners_or_none(trial, boxes):
         return None
-    proof: str | None = (
-        "boxes with their score, and classes; pixels as the Open Model Zoo takes them, which hvt.mean overrules"
-    )
-    if trial.ports[boxes].name == "dets" and "hvt.mean" not in trial.metadata:
-        proof = None  # MMDeploy's, whose networks each take other pixels
-    return Match((boxes, kinds), None, Corners(), proof)
+    proof = "boxes with their score, and classes; pixels as the Open Model Zoo takes them, which hvt.mean overrules"
+    mmdeploy = trial.ports[boxes].name == "dets"
+    return Match((boxes, kinds), None, Corners(), _if_pixels_are(trial, proof, usual=not mmdeploy))
+
+
+def _if_pixels_are(trial: Trial, proof: str | None, *, usual: bool) -> str | None:
+    # No proof where networks with these very outputs take pixels in several ways, and the file does not say how.
+    return proof if usual or "hvt.mean" in trial.metadata else None
 
 
 def _lists(trial: Trial, *, leave: int | None) -> tuple[int, int, int] | None:

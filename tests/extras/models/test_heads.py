@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from onnx import TensorProto, helper
 
@@ -144,15 +145,60 @@ def test_layers_that_only_training_reads_are_passed_over(tmp_path: Path) -> None
     check(opened(write(tmp_path / "m.onnx", graph, outputs)), "rt-detr")
 
 
-def test_boxes_of_mmdeploy_need_a_word_about_their_pixels(tmp_path: Path) -> None:
-    """Its networks take pixels in three ways, and the outputs of all look alike: nothing would be found."""
-    graph = Graph()
-    boxes, scores = graph.find("images", bgr=True, top=255)
+def _mmdeploy(graph: Graph, boxes: str, scores: str) -> dict[str, str]:
     table = graph.batch(graph.op("Concat", boxes, graph.column(scores), axis=1))
-    path = write(tmp_path / "m.onnx", graph, {"dets": table, "labels": graph.const([[0, 1]], np.int64)})
-    with pytest.raises(UserError, match="could be atss, which --head"):
+    return {"dets": table, "labels": graph.const([[0, 1]], np.int64)}
+
+
+def _mmyolo(graph: Graph, boxes: str, scores: str) -> dict[str, str]:
+    lists = {"boxes": graph.batch(boxes), "scores": graph.batch(scores)}
+    return {"num_dets": graph.const([[2]], np.int64), **lists, "labels": graph.const([[0, 1]], np.int64)}
+
+
+def _damo(graph: Graph, boxes: str, scores: str) -> dict[str, str]:
+    cells, rest = FAMILIES["yolo-nas"][1](graph, "images").values()
+    del boxes, scores
+    return {"output": rest[0], "953": cells[0]}
+
+
+def _onnx_zoo(graph: Graph, boxes: str, scores: str) -> dict[str, str]:
+    shares = graph.batch(graph.shares(boxes))
+    return {"bboxes": shares, "labels": graph.const([[0, 1]], np.int64), "scores": graph.batch(scores)}
+
+
+def _custom_vision(graph: Graph, boxes: str, scores: str) -> dict[str, str]:
+    labels = graph.const([[0, 1]], np.int64)
+    return {
+        "detected_boxes": graph.batch(boxes),
+        "labels": labels,
+        "detected_scores": graph.batch(scores),
+    }
+
+
+@pytest.mark.parametrize(
+    ("build", "head"),
+    [
+        (_mmdeploy, "atss"),
+        (_mmyolo, "nms-lists"),
+        (_damo, "yolo-nas"),
+        (_onnx_zoo, "labels-boxes-scores"),
+        (_custom_vision, "labels-boxes-scores"),
+    ],
+)
+def test_where_pixels_may_be_of_several_kinds_the_file_has_to_say(
+    tmp_path: Path, build: Any, head: str
+) -> None:
+    """Networks with these outputs take pixels in three ways, and all look alike: nothing would be found."""
+    graph = Graph()
+    outputs = build(graph, *graph.find("images", bgr=head == "atss", top=255 if head == "atss" else 1))
+    path = write(tmp_path / "m.onnx", graph, outputs)
+    with pytest.raises(UserError, match=f"could be {head}, which --head .* hvt.mean"):
         opened(path)
-    check(opened(path, head="atss"), "atss")
+    check(opened(path, head=head), head)
+    model = onnx.load(path)
+    helper.set_model_props(model, {"hvt.mean": "0"})
+    onnx.save(model, path)
+    check(opened(path), head)
 
 
 def test_raw_levels_beside_the_rows_are_passed_over(tmp_path: Path) -> None:
@@ -176,6 +222,20 @@ def test_classes_without_names_are_numbers_and_said_once(tmp_path: Path, caplog)
         assert len(said) == 1
         assert f"class 0 to class {classes - 1}" in said[0]
     assert opened(Path(path), labels=Path("coco")).class_names[:2] == ("person", "bicycle")
+
+
+@pytest.mark.parametrize(
+    ("family", "truck"), [("tensorflow", 7), ("ssd", 8), ("TensorRT's NMS", 7), ("d-fine, deployed", 7)]
+)
+def test_coco_names_are_those_of_the_numbers_that_a_network_lists(
+    tmp_path: Path, family: str, truck: int
+) -> None:
+    """TensorFlow, torchvision and the Open Model Zoo number by COCO's ids: a person would be a bicycle."""
+    names = opened(family_model(tmp_path / "m.onnx", family), labels=Path("coco")).class_names
+    assert names[truck] == "truck"
+    by_id = family in ("tensorflow", "ssd")
+    assert (len(names), names[-1]) == (83 + truck if by_id else 80, "toothbrush")
+    assert (names[truck + 4] == "class 12") == by_id
 
 
 def test_a_class_beyond_the_names_is_said_once(tmp_path: Path, caplog) -> None:
@@ -296,7 +356,7 @@ def write(path: Path, graph: Graph, outputs: dict[str, str], *, second: str = ""
     graph.nodes += [helper.make_node("Identity", [tensor], [name]) for name, tensor in outputs.items()]
     ports = [
         helper.make_tensor_value_info(
-            name, TensorProto.INT64 if name == "labels" else TensorProto.FLOAT, None
+            name, TensorProto.INT64 if name in ("labels", "num_dets") else TensorProto.FLOAT, None
         )
         for name in outputs
     ]

@@ -296,7 +296,9 @@ def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
         raise UserError(f"its outputs fit no head that is known{more}")
     likely = [name for name, match in found.items() if match.possible and _explains(trial, match)]
     could = " or ".join(certain or likely or found)
-    raise UserError(f"its outputs could be {could}, which --head NAME decides")
+    raise UserError(
+        f"its outputs could be {could}, which --head NAME decides; hvt.mean, hvt.scale in its metadata say its pixels"
+    )
 
 
 def _named(trial: Trial, name: str, by: str) -> Head:
