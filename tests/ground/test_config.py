@@ -168,6 +168,16 @@ def test_on_a_full_disk_it_keeps_what_it_wrote_too(tmp_path, monkeypatch):
     assert [one.read_text() for one in tmp_path.glob("earlier-*-f.rrd")] == ["flight"]
 
 
+def test_what_was_moved_stays_where_each_start_is_of_the_same_time(tmp_path, monkeypatch):
+    """A machine without a clock of its own boots at the same second each time: one flight would replace the other."""
+    monkeypatch.setattr("time.strftime", lambda *_: "19700101-000030")
+    flights = ["1", "2", "3"]
+    for one in flights:
+        (tmp_path / "f.rrd").write_text(one)
+        set_aside(read("--record", str(tmp_path / "f.rrd")))
+    assert sorted(one.read_text() for one in tmp_path.glob("earlier-*/f.rrd")) == flights
+
+
 def test_nothing_is_moved_from_under_a_ground_that_still_records(tmp_path):
     """A second one that is started by mistake would end the recording of the first."""
     for one in ("f.rrd", "t.csv"):

@@ -81,7 +81,11 @@ def set_aside(config: GroundConfig) -> None:
     """
     if any(suffix == ".rrd" and path.is_file() and _is_written(path) for _, path, suffix in written(config)):
         return
-    stamp = time.strftime("%Y%m%d-%H%M%S")
+    stamp = f"earlier-{time.strftime('%Y%m%d-%H%M%S')}"
+    stamps = chain([stamp], (f"{stamp}-{number}" for number in count_from(2)))
+    # Without a battery the clock says the same at each start.
+    parents = [path.resolve().parent for _, path, _ in written(config)]
+    free = next(one for one in stamps if not any(list(parent.glob(f"{one}*")) for parent in parents))
     for name, path, suffix in written(config):
         file = path.resolve()
         numbered = name == "--record" and config.split is not None
@@ -90,7 +94,7 @@ def set_aside(config: GroundConfig) -> None:
         # Beside it: the pictures of a table of stills, the older half of a log.
         stem = escape(file.stem)
         beside = [f"{stem}-[0-9]*.png"] if name == "--stills" else [f"{stem}-before{escape(file.suffix)}"]
-        folder = file.with_name(f"earlier-{stamp}")
+        folder = file.with_name(free)
         try:
             if not file.stat().st_size:
                 continue
