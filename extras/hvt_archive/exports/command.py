@@ -197,7 +197,8 @@ def _kind_of(out: Path | None) -> str:
 
 def _beside(recording: Path, kind: str) -> Path:
     """The same name with another end, which nobody gave and which therefore must be free."""
-    out = recording.with_suffix(f".{kind}" if kind in _FOLDERS else _suffix(kind))
+    # A folder such as ``.`` has no name, and is told of where it is read.
+    out = recording.parent / f"{recording.stem}{f'.{kind}' if kind in _FOLDERS else _suffix(kind)}"
     if out.exists():
         raise UserError(f"{out} is there already: name another with --out")
     return out
