@@ -224,6 +224,8 @@ class Hub:
 
     def begin(self, edge: EdgePage, session: dict[str, Any]) -> None:
         """A session begins: the streams of the former one are over."""
+        if (before := self.edges.get(edge.edge)) is not None:  # who looks goes on seeing these
+            edge.stills, edge.pictures = before.stills, before.pictures
         self.edges[edge.edge] = edge
         self._absent.discard(edge.edge)
         edge.session = session

@@ -90,9 +90,9 @@ function onMessage(message, payload) {
       forgetEvents();
       break;
     case "session":
-      if (mine && sessions.get(chosen)?.session !== message.session) forget(); // it begins anew, with other frames
+      if (sessions.get(message.edge)?.session !== message.session) wall.event(message.edge, ""); // it begins anew
+      if (mine && sessions.get(chosen)?.session !== message.session) forget(); // with other frames
       sessions.set(message.edge, message);
-      wall.card(message.edge);
       if (mine) describe();
       else if (!chosen) chooseFirst();
       break;
@@ -160,8 +160,6 @@ function choose(edge) {
   wall.mark(edge);
   plot.show(edge);
   by("answer").hidden = true;
-  by("settings-text").textContent = "";
-  keyframeAt = 0;
   forget();
   by("link-text").textContent = by("failed").textContent = "";
   by("why-list").replaceChildren();
@@ -175,6 +173,8 @@ function choose(edge) {
 function forget() {
   player.clear();
   boxes.reset();
+  by("settings-text").textContent = "";
+  keyframeAt = 0;
   shown = { frame: -1, captured: 0, at: 0 };
   periods = [];
   by("tracks").replaceChildren();

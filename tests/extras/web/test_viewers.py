@@ -188,6 +188,15 @@ def test_a_reload_shows_the_last_picture_of_an_edge_that_is_silent(hub):
     assert "thumbnail" in kinds(viewer)
 
 
+def test_stills_of_the_flight_before_stay_where_an_edge_starts_again(hub):
+    """The page lists them on, and those that it had not loaded yet would be broken pictures."""
+    before = flown(hub, frames=3, keyframe_every=10)
+    hub.still(before, "{}", [("000001-0", "still", b"picture", "image/jpeg")])
+    flown(hub, frames=3, keyframe_every=10)
+    now = hub.edges["uav-1"]
+    assert (list(now.stills), now.pictures.get("000001-0", "still")) == (["{}"], (b"picture", "image/jpeg"))
+
+
 def test_edges_that_the_ground_has_left_are_forgotten(hub):
     """Who invents names would fill its memory, and every wall; a newcomer is there before the state knows it."""
     for name in ("gone", "here"):

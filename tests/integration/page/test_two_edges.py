@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 
-from hvt_ground.events import VideoSample
+from hvt_ground.events import Notice, VideoSample
 from hvt_web.server import WebPage
 from media.moving_square import FPS, SIZE, moving_square
 from programs.processes import eventually, free_ports
@@ -81,4 +81,23 @@ def test_no_pixel_of_one_edge_stands_under_the_name_of_another(address, rung):
         assert page.inner_text("#objects-title") == "Tracks: not known yet"
         page.locator('.edge[data-edge="flies"]').click()
         eventually(lambda: page.evaluate(_SHOWN)["drawn"], what="the first edge's picture again")
+        browser.close()
+
+
+def test_an_edge_that_starts_again_bears_no_word_of_the_flight_before():
+    """``this session has ended`` stood beside the green light of one that flies."""
+    from playwright.sync_api import sync_playwright
+
+    (port,) = free_ports(1)
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as ground, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{port}/")
+        ground.feed(INFO)().log(Notice(0, 0, "info", "the flight has ended"))
+        page.locator(".last", has_text="the flight has ended").wait_for()
+        page.keyboard.press("k")
+        page.locator("#settings-text", has_text="the link is not open yet").wait_for(state="attached")
+        ground.feed(replace(INFO, session_id=INFO.session_id + 1))()
+        for where in (".last", "#settings-text"):
+            eventually(lambda where=where: not page.text_content(where), what=f"no word in {where}")
         browser.close()
