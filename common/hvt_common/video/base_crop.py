@@ -17,7 +17,7 @@ import numpy.typing as npt
 from hvt_common.values import Image, View
 
 if TYPE_CHECKING:  # the command line needs sizes alone, and no PyAV
-    from hvt_common.video.hevc import Plane, YuvPicture
+    from hvt_common.video.hevc import Picture, Plane
 
 MAX_SIDE_PX = 512
 """A longer crop is coded smaller: an object that fills 512 pixels needs no more to be classified."""
@@ -35,7 +35,7 @@ def coded_size(
 
 
 def base_crop(
-    picture: Image | YuvPicture,
+    picture: Picture,
     *,
     view: View,
     crop_source_px: tuple[int, int, int, int],

@@ -6,6 +6,7 @@ Also the NAL units in an Annex B byte stream (ITU-T H.264 and H.265, annex B).
 from __future__ import annotations
 
 import re
+from threading import Lock
 from typing import cast
 
 import av
@@ -39,13 +40,34 @@ _FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype
 Plane = npt.NDArray[np.uint8]
 
 
-class YuvPicture:
-    """A decoded picture, 4:2:0, half the memory of its BGR; one thread at a time converts a decoder's pictures."""
+class ToBgr:
+    """Converts the pictures of one decoder, for any thread: those that come at the same moment take turns."""
 
-    def __init__(self, picture: av.VideoFrame, converter: VideoReformatter) -> None:
+    def __init__(self) -> None:
+        self._converter, self._lock = VideoReformatter(), Lock()
+
+    def __call__(self, picture: av.VideoFrame) -> Image:
+        """Uint8 (H, W, 3)."""
+        with self._lock:
+            bgr = self._converter.reformat(
+                picture,
+                format="bgr24",
+                src_colorspace=Colorspace.ITU709,
+                src_color_range=ColorRange.MPEG,
+                dst_color_range=ColorRange.JPEG,
+                interpolation=UNBIASED,
+                threads=1,
+            )
+        return cast("Image", np.asarray(bgr.to_ndarray(), np.uint8))
+
+
+class YuvPicture:
+    """A decoded picture, 4:2:0, half the memory of its BGR."""
+
+    def __init__(self, picture: av.VideoFrame, to_bgr: ToBgr) -> None:
         self.frame = picture
         """That of libavcodec, for coding it again."""
-        self._converter = converter
+        self._to_bgr = to_bgr
         self.size = (picture.width, picture.height)
 
     @property
@@ -76,16 +98,11 @@ class YuvPicture:
 
     def bgr(self) -> Image:
         """Uint8 (H, W, 3), the same at every call."""
-        bgr = self._converter.reformat(
-            self.frame,
-            format="bgr24",
-            src_colorspace=Colorspace.ITU709,
-            src_color_range=ColorRange.MPEG,
-            dst_color_range=ColorRange.JPEG,
-            interpolation=UNBIASED,
-            threads=1,
-        )
-        return cast("Image", np.asarray(bgr.to_ndarray(), np.uint8))
+        return self._to_bgr(self.frame)
+
+
+Picture = Image | YuvPicture
+"""BGR, or as it was decoded."""
 
 
 class BaseDecoder:
@@ -102,7 +119,7 @@ class BaseDecoder:
     def __init__(self, *, size: tuple[int, int] | None = None) -> None:
         self._max_px = MAX_PICTURE_PX if size is None else min(MAX_PICTURE_PX, _filled_px(size))
         self._context = self._open()
-        self._to_bgr = VideoReformatter()
+        self._to_bgr = ToBgr()
 
     def decode(self, data: bytes) -> Image | None:
         """Return the picture, uint8 (H, W, 3) BGR in base pixels, or None where the unit cannot be decoded."""

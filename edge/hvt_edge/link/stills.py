@@ -16,7 +16,7 @@ from hvt_common.protocol.messages import BASE_CODEC, AlsoShown, InfoRequest, Roi
 from hvt_common.runtime.statistics import Newest
 from hvt_common.values import Image, View
 from hvt_common.video.base_crop import base_crop
-from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.hevc import Picture
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db
 
 _log = logging.getLogger(__name__)
@@ -128,9 +128,7 @@ class Still:
         )
         return cls(header, codec.media_type, np.asarray(pixels, np.uint8))
 
-    def beside(
-        self, base: Image | YuvPicture, *, view: View, min_gain_db: float, used: bool = False
-    ) -> Still:
+    def beside(self, base: Picture, *, view: View, min_gain_db: float, used: bool = False) -> Still:
         """The same with what the base of its frame shows there; ``used``: the still builds on that."""
         height, width = self.crop_bgr.shape[:2]
         size, header = (width, height), self.header

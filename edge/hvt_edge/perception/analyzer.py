@@ -15,7 +15,7 @@ from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
-from hvt_common.video.hevc import BaseDecoder, YuvPicture
+from hvt_common.video.hevc import BaseDecoder, Picture, YuvPicture
 from hvt_edge.perception.cpu_budget import CpuBudget
 
 
@@ -24,7 +24,7 @@ class AnalyzedFrame:
     """One source frame with all that is known of it."""
 
     frame: Frame
-    base: Image | YuvPicture | None
+    base: Picture | None
     """The decoded base frame: what the ground has, and what a still may build on. None where the frame is not coded:
     no still applies to it then."""
     tracks: Tracks

@@ -19,7 +19,7 @@ from typing import Literal
 from hvt_common.protocol.messages import AlsoShown
 from hvt_common.values import Frame, Image, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, coded_size
-from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.hevc import Picture
 from hvt_common.video.still_codecs import (
     CodedCrop,
     JpegCodec,
@@ -109,7 +109,7 @@ class StillMaker:
         return tuple(dict.fromkeys((self.preferred.name, self.without_base.name)))
 
     def crop(
-        self, frame: Frame, request: Request, *, view: View, base: Image | YuvPicture | None = None
+        self, frame: Frame, request: Request, *, view: View, base: Picture | None = None
     ) -> Still | NoStill:
         """Take the request's crop out of ``frame``, which is the frame the request was made at.
 

@@ -15,7 +15,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 
 from hvt_common.values import Image, Tracks
-from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.hevc import Picture, YuvPicture
 
 DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 
@@ -37,7 +37,7 @@ class History:
     gap_frames: int = 0
 
     def __post_init__(self) -> None:
-        self._frames: OrderedDict[int, Image | YuvPicture] = OrderedDict()
+        self._frames: OrderedDict[int, Picture] = OrderedDict()
         self._frame_bytes = 0
         self._tracks: OrderedDict[int, Tracks] = OrderedDict()
 
@@ -56,7 +56,7 @@ class History:
         """Frame index of the newest tracks held; None before the first."""
         return next(reversed(self._tracks), None)
 
-    def add_frame(self, frame_index: int, picture: Image | YuvPicture) -> None:
+    def add_frame(self, frame_index: int, picture: Picture) -> None:
         """Keep a decoded picture (not copied: nobody may write to it again)."""
         _require_rising(next(reversed(self._frames), None), frame_index)
         self._frames[frame_index] = picture
@@ -85,7 +85,7 @@ class History:
             if len(self._tracks) > self.track_frames:
                 self._tracks.popitem(last=False)
 
-    def picture(self, frame_index: int) -> Image | YuvPicture | None:
+    def picture(self, frame_index: int) -> Picture | None:
         """The picture of that frame as it was given; None if it was never decoded or is gone."""
         return self._frames.get(frame_index)
 
@@ -130,7 +130,7 @@ class History:
         return len(self._frames) > self.max_frames or self._frame_bytes > self.max_bytes
 
 
-def as_bgr(picture: Image | YuvPicture) -> Image:
+def as_bgr(picture: Picture) -> Image:
     return picture.bgr() if isinstance(picture, YuvPicture) else picture
 
 

@@ -26,7 +26,8 @@ from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.process import lower_priority
 from hvt_common.tracking.settings import weak_confidence
-from hvt_common.values import Detections, Image
+from hvt_common.values import Detections
+from hvt_common.video.hevc import Picture
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.perception.stills.vocabulary import check_common
 
@@ -34,33 +35,33 @@ from hvt_ground.perception.stills.vocabulary import check_common
 class Detection:
     """A picture that waits for the detector, is in it, or was."""
 
-    def __init__(self, image: Image, detect: Callable[[Image], Detections]) -> None:
+    def __init__(self, picture: Picture, detect: Callable[[Picture], Detections]) -> None:
         self.found: Future[Detections] = Future()
-        self._image: Image | None = image
+        self._picture: Picture | None = picture
         self._detect = detect
         self._lock = threading.Lock()
 
     @property
     def queued(self) -> bool:
         """It is not in the detector yet."""
-        return self._image is not None
+        return self._picture is not None
 
-    def replace(self, image: Image) -> bool:
+    def replace(self, picture: Picture) -> bool:
         """Wait with a newer picture; False where the detector has the first already."""
         with self._lock:
-            if self._image is None:
+            if self._picture is None:
                 return False
-            self._image = image
+            self._picture = picture
             return True
 
     def run(self) -> None:
         """Search the picture; for the detector's thread."""
         with self._lock:
-            image, self._image = self._image, None
-        if image is None or not self.found.set_running_or_notify_cancel():
+            picture, self._picture = self._picture, None
+        if picture is None or not self.found.set_running_or_notify_cancel():
             return
         try:
-            self.found.set_result(self._detect(image))
+            self.found.set_result(self._detect(picture))
         except BaseException as error:  # noqa: BLE001 - raised where it is taken
             self.found.set_exception(error)
 
@@ -73,9 +74,9 @@ class DetectorThread:
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def submit(self, image: Image, detect: Callable[[Image], Detections]) -> Detection:
+    def submit(self, picture: Picture, detect: Callable[[Picture], Detections]) -> Detection:
         """Have a picture searched as soon as those are that were asked for before."""
-        detection = Detection(image, detect)
+        detection = Detection(picture, detect)
         self._queue.put(detection)
         with self._lock:
             if self._thread is None:

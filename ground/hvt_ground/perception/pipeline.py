@@ -19,7 +19,7 @@ from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Detections, Image, Tracks, View
-from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.hevc import Picture, YuvPicture
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
@@ -68,7 +68,7 @@ class DecodedFrame:
     reference_ns: int | None
     """The moment on our clock that latency counts from: capture, or in lockstep the receiving; None where the
     camera's clock cannot be right."""
-    picture: Image | YuvPicture
+    picture: Picture
     """Converted to BGR by whom it is analyzed."""
 
 
@@ -318,7 +318,7 @@ class Pipeline:
         # Whether this picture is searched: begun here, or in place of one that has waited until now.
         parts, last, index = self._parts, self._detected_frame, picture.frame_index
         if self._detection is not None:
-            if not self._detection.queued or not self._detection.replace(as_bgr(picture.picture)):
+            if not self._detection.queued or not self._detection.replace(picture.picture):
                 return False
             self._detected_frame = index
             return True
@@ -332,7 +332,7 @@ class Pipeline:
         if due:
             self._detected_frame = index
             self._due_ns = picture.capture_ns
-            self._detection = parts.detector_thread.submit(as_bgr(picture.picture), self._detect)
+            self._detection = parts.detector_thread.submit(picture.picture, self._detect)
         return due
 
     def _is_found(self, detection: Detection, news: threading.Event | None) -> bool:
@@ -347,9 +347,9 @@ class Pipeline:
             news.wait()
         return detection.found.done()
 
-    def _detect(self, image: Image) -> Detections:
-        # In the detector's thread.
-        parts = self._parts
+    def _detect(self, picture: Picture) -> Detections:
+        # In the detector's thread, which makes the picture's BGR: one that is replaced before needs none.
+        parts, image = self._parts, as_bgr(picture)
         self._detections_run += 1
         found = parts.detector.detect(image) or Detections.none()
         return found if parts.search is None else parts.search.take(found, image)
@@ -430,7 +430,7 @@ class Pipeline:
             self._history.rename_track(survivor_id, merged_id)
 
 
-def _gray(picture: Image | YuvPicture) -> Image:
+def _gray(picture: Picture) -> Image:
     # What it takes to follow the camera. Only pictures that are searched are converted to BGR.
     return picture.gray() if isinstance(picture, YuvPicture) else picture
 

@@ -7,11 +7,11 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
-from av.video.reformatter import ColorRange, VideoReformatter
+from av.video.reformatter import ColorRange
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hvt_common.video.hevc import MAX_SIDE_PX, BaseDecoder, YuvPicture
+from hvt_common.video.hevc import MAX_SIDE_PX, BaseDecoder, ToBgr, YuvPicture
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
@@ -67,7 +67,7 @@ def test_gray_of_a_camera_of_full_range_is_not_stretched():
         np.concatenate((ramp, np.full((8, 256), 128, np.uint8))), format="yuvj420p"
     )
     frame.color_range = ColorRange.JPEG
-    picture = YuvPicture(frame, VideoReformatter())
+    picture = YuvPicture(frame, ToBgr())
     assert np.array_equal(picture.gray(), ramp)
     assert np.abs(picture.bgr()[..., 1].astype(int) - picture.gray()).max() <= 2, "as the colours"
 

@@ -31,6 +31,7 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Detections, Image, Posterior, Tracks, View
+from hvt_common.video.hevc import Picture
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
@@ -143,9 +144,9 @@ class SameAnswer:
 class DetectsAtOnce(DetectorThread):
     """In the thread that asks, so that no list goes out without what its picture shows, however busy the machine."""
 
-    def submit(self, image: Image, detect: Callable[[Image], Detections]) -> Detection:
+    def submit(self, picture: Picture, detect: Callable[[Picture], Detections]) -> Detection:
         """Search it."""
-        detection = Detection(image, detect)
+        detection = Detection(picture, detect)
         detection.run()
         return detection
 

@@ -9,7 +9,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.messages import MAX_STILL_CODECS, RoiHeader
 from hvt_common.values import Image, View
 from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, MAX_SIDE_PX, base_crop
-from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.hevc import Picture
 from hvt_common.video.still_codecs import BaseMissingError, StillError, still_codec, still_codec_names
 
 _MOST_BASE_PX = 32
@@ -53,7 +53,7 @@ def needs_base(header: RoiHeader) -> bool:
         return False
 
 
-def decode_still(still: ReceivedStill, *, base: Image | YuvPicture | None, view: View) -> Image:
+def decode_still(still: ReceivedStill, *, base: Picture | None, view: View) -> Image:
     """The crop at the size at which it was coded, BGR.
 
     ``base`` is the decoded base frame of the still's own index, None where it is not at hand; only codecs that
