@@ -209,7 +209,7 @@ def _classes(pictures: Sequence[LabelledPicture]) -> list[str]:
         if isinstance(picture.labels, tuple):
             used = {str(row["name"]) for row in picture.labels}
         found |= dict.fromkeys(name for name in picture.class_names if used is None or name in used)
-    names = [name for name in found if name.casefold() not in IGNORED]
+    names = [name for name in found if name and name.casefold() not in IGNORED]
     if not names:
         raise UserError("the labels name no class: there is nothing to learn")
     return names

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -52,7 +53,7 @@ _DEPTH = 3
 
 
 class Folders:
-    """What lies in folders, whatever the case of its name: ``A.JPG`` has its labels in ``A.TXT`` too."""
+    """What lies in folders, whatever the case and the accents' form of its name: ``A.JPG`` has ``A.TXT`` too."""
 
     def __init__(self) -> None:
         self._names: dict[Path, dict[str, str]] = {}
@@ -66,9 +67,14 @@ class Folders:
         if folder is None or not folder.is_dir():
             return None
         if folder not in self._names:
-            self._names[folder] = {one.name.lower(): one.name for one in folder.iterdir()}
-        name = self._names[folder].get(path.name.lower())
+            self._names[folder] = {_plain(one.name): one.name for one in folder.iterdir()}
+        name = self._names[folder].get(_plain(path.name))
         return None if name is None else folder / name
+
+
+def _plain(name: str) -> str:
+    # An accent may be a letter's own, or one behind it, as macOS writes it.
+    return unicodedata.normalize("NFC", name).lower()
 
 
 def pictures_below(place: Path) -> list[Path]:
@@ -255,22 +261,24 @@ def read_voc(path: Path) -> VocFile:
         raise UserError(f"{path} cannot be read ({error.strerror})") from None
     except (ET.ParseError, ValueError, LookupError) as error:
         raise UserError(f"{path} is not an XML of Pascal VOC ({error})") from None
-    sides = tuple(int(_number(root.findtext(f"size/{side}"))) for side in ("width", "height"))
+    sides = tuple(int(number_of(root.findtext(f"size/{side}"))) for side in ("width", "height"))
     size = (sides[0], sides[1]) if min(sides) > 0 else None
     corners = ("xmin", "ymin", "xmax", "ymax")
     return VocFile(
         size,
         tuple(
             (
-                "difficult" if _number(one.findtext("difficult")) else (one.findtext("name") or "").strip(),
-                tuple(_number(one.findtext(f"bndbox/{corner}"), missing=float("nan")) for corner in corners),
+                "difficult" if number_of(one.findtext("difficult")) else (one.findtext("name") or "").strip(),
+                tuple(
+                    number_of(one.findtext(f"bndbox/{corner}"), missing=float("nan")) for corner in corners
+                ),
             )
             for one in root.iter("object")
         ),
     )
 
 
-def _number(text: str | None, *, missing: float = 0.0) -> float:
+def number_of(text: str | None, *, missing: float = 0.0) -> float:
     try:
         value = float((text or "").replace(",", "."))
     except ValueError:
@@ -310,11 +318,15 @@ def read_yolo(
     picture is cut, and a row that cannot be is left out; ``doubts`` counts both.
     """
     rows = []
+    doubts.classes = len(names)
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
         try:
-            kind, *corners = _yolo_row(path, number, line, len(names), keypoints)
+            kind, *corners = _yolo_row(path, number, line, keypoints)
+            doubts.kinds.add(kind)
+            if kind not in range(len(names)):
+                raise UserError(f"{path}, line {number} has class {kind:g}; there are {len(names)}, from 0")  # noqa: TRY301
         except UserError as error:
             doubts.leave_out(str(error))
             continue
@@ -322,7 +334,7 @@ def read_yolo(
     return doubts.labels(rows, size, size)
 
 
-def _yolo_row(path: Path, number: int, line: str, classes: int, keypoints: int) -> list[float]:
+def _yolo_row(path: Path, number: int, line: str, keypoints: int) -> list[float]:
     """Class and x1 y1 x2 y2 as shares of the picture."""
     try:
         row = [float(word.replace(",", ".")) for word in line.split()]
@@ -333,8 +345,6 @@ def _yolo_row(path: Path, number: int, line: str, classes: int, keypoints: int) 
     polygon = len(row) >= _LEAST_POLYGON and len(row) % 2 == 1
     if not (YOLO_COLUMNS <= len(row) <= _MOST_COLUMNS or polygon) or not all(map(math.isfinite, row)):
         raise UserError(f"{path}, line {number} is {line[:60]!r}; accepted is class cx cy w h, all numbers")
-    if row[0] not in range(classes):
-        raise UserError(f"{path}, line {number} has class {row[0]:g}; there are {classes}, from 0")
     if polygon:
         box = [min(row[1::2]), min(row[2::2]), max(row[1::2]), max(row[2::2])]
     else:

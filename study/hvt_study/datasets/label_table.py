@@ -19,7 +19,7 @@ import numpy.typing as npt
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
-from hvt_study.datasets.labels import FrameLabels, covered_share, inside_frame
+from hvt_study.datasets.labels import FrameLabels, check_pixels, covered_share, inside_frame
 
 _COVERED = 0.5
 """An object with so much of it in regions of which nothing is known does not count, as in VisDrone's toolkit."""
@@ -67,6 +67,7 @@ class LabelTable:
         origin: float = 0.0,
     ) -> LabelTable:
         """Those rows that are ``judged``, cut at the frame of this (width, height); empty ones are left out."""
+        check_pixels(rows.path, [rows[side] for side in "xywh"])
         frames, boxes = rows["frame"].astype(np.int64), inside_frame(rows.boxes(origin=origin), size)
         regions = inside_frame(ignored.boxes, size)
         places = _rows_with_area(ignored.frames, regions)

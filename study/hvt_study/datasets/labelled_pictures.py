@@ -34,6 +34,7 @@ from hvt_study.datasets.label_files import (
     coco_files,
     keypoint_columns,
     label_file,
+    number_of,
     pictures_below,
     read_class_file,
     read_text,
@@ -43,7 +44,7 @@ from hvt_study.datasets.label_files import (
     yolo_names,
 )
 from hvt_study.datasets.label_table import image_labels
-from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
+from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts, check_pixels
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import NOMINAL_FPS
@@ -155,6 +156,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     names: Sequence[str] = VISDRONE_NAMES if visdrone else ()
     keypoints = 0
     if voc:
+        check_pixels(place, [side for one in voc.values() for _, box in one.objects for side in box])
         named = {name for one in voc.values() for name, _ in one.objects}
         names = tuple(sorted(name for name in named if name and name.casefold() not in IGNORED))
     elif texts and not visdrone:
@@ -228,7 +230,9 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
     """COCO's ``images``, ``annotations`` (also ``annotation``) and ``categories``."""
     try:
         about = json.loads(read_text(path))
-        names = {_id(row["id"]): str(row["name"]) for row in about["categories"]}
+        categories = [(_id(row["id"]), str(row["name"] or "")) for row in about["categories"]]
+        names = dict(categories)
+        unclear_names = {key for key, name in categories if names[key] != name}
         rows = about["annotations"] if "annotations" in about else about["annotation"]
         images = [
             (
@@ -242,14 +246,17 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
         for number, row in enumerate(rows, start=1):
             where = f"COCO annotation {row.get('id', number)} of {path.name}"
             image, category = _id(row.get("image_id")), _id(row.get("category_id"))
-            if image not in of or category not in names:
-                doubts.leave_out(f"{where} has an image_id or a category_id that the file does not have")
+            if image not in of or category not in names or category in unclear_names:
+                doubts.leave_out(
+                    f"{where} has an image_id or a category_id that the file does not have, or has with two names"
+                )
                 continue
             of[image].append({**row, "name": names[category], "where": where})
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         why = f"{error}" if isinstance(error, ValueError) else "it lacks images, annotations or categories"
         raise UserError(f"{path} is not COCO's JSON: {why}") from None
-    _check_pixels(path, rows)
+    sides = (side for row in rows for side in row.get("bbox") or ())
+    check_pixels(path, [side for side in sides if isinstance(side, int | float)])
     folders = Folders()
     pictures: dict[Path, tuple[str, Any, tuple[int, int] | None]] = {}
     unclear = {key for key, count in Counter(key for key, _, _ in images).items() if count > 1}
@@ -282,22 +289,14 @@ def _id(value: Any) -> Any:
     return int(value) if isinstance(value, str) and value.isdecimal() else value
 
 
-def _check_pixels(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Raise `UserError` where all boxes are shares of their pictures."""
-    numbers = [side for row in rows for side in row.get("bbox") or () if isinstance(side, int | float)]
-    if numbers and 0 < max(map(abs, numbers)) <= 1:
-        raise UserError(f"{path} has boxes of 0 to 1; COCO's are x, y, width, height in pixels")
-
-
 def _said_size(image: Mapping[str, Any]) -> tuple[int, int] | None:
-    wide, high = image.get("width"), image.get("height")
-    known = isinstance(wide, int) and isinstance(high, int) and wide > 0 and high > 0
-    return (int(wide), int(high)) if known else None  # type: ignore[arg-type]
+    wide, high = (int(number_of(str(image.get(side)))) for side in ("width", "height"))
+    return (wide, high) if min(wide, high) > 0 else None
 
 
 def _coco_row(row: Mapping[str, Any]) -> _Annotation:
     box = row.get("bbox")
-    name = "ignore" if row.get("iscrowd") else str(row["name"])
+    name = "ignore" if row.get("iscrowd") or row.get("ignore") else str(row["name"])
     numbers = isinstance(box, list) and len(box) == 4 and all(isinstance(side, int | float) for side in box)
     if box is None or not numbers:
         return name, None, f"{row['where']} has the box {box}: it"

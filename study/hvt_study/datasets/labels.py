@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -67,6 +68,9 @@ class LabelDoubts:
     """What was wrong with the labels of a set, counted; the worst, or the first, is named."""
 
     good: int = 0
+    kinds: set[float] = field(default_factory=set)
+    """Classes by number, where a set counts them, and how many it names."""
+    classes: int = 0
     _clipped: int = 0
     _worst: tuple[float, str] = (0.0, "")
     _left_out: int = 0
@@ -134,9 +138,19 @@ class LabelDoubts:
         return said
 
     def check(self) -> None:
-        """`UserError` where rows were left out and none was good: nothing can be said of such a set."""
+        """`UserError` where rows were left out and none was good, or classes are counted from 1."""
+        if self.classes in self.kinds and 0 not in self.kinds:
+            raise UserError(f"{self._first}, and none is of class 0: count classes from 0")
         if self._left_out and not self.good:
             raise UserError(self._first)
+
+
+def check_pixels(path: Path, numbers: npt.ArrayLike) -> None:
+    """Raise `UserError` where all numbers of the boxes of a file are shares of their pictures."""
+    sides = np.asarray(numbers, np.float64)
+    sides = sides[np.isfinite(sides)]
+    if 0 < np.abs(sides).max(initial=0) <= 1 and (sides % 1).any():
+        raise UserError(f"{path} has boxes of 0 to 1, and boxes are in pixels there")
 
 
 def covered_share(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.float64]:

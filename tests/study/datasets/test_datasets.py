@@ -279,13 +279,21 @@ def test_mot_labels(tmp_path):
     assert alone.name == "MOT17-02"
 
 
-def test_labels_that_count_frames_from_0_are_refused_beside_images_from_1(tmp_path):
+def test_labels_that_count_frames_or_pixels_otherwise_than_images_are_refused(tmp_path):
     """Trackers write so (ByteTrack#417), and every label would be a frame late."""
     write_mot(tmp_path / "MOT17-02")
     truth = tmp_path / "MOT17-02" / "gt" / "gt.txt"
     rows = [line.split(",", 1) for line in truth.read_text().splitlines()]
     truth.write_text("".join(f"{int(frame) - 1},{rest}\n" for frame, rest in rows))
     with pytest.raises(UserError, match="images from 1, and its annotations count frames from 0"):
+        open_dataset(f"mot:{tmp_path}")
+    truth.write_text("".join(f"{frame},{rest}\n" for frame, rest in rows))
+    for image in sorted((tmp_path / "MOT17-02" / "img1").iterdir()):
+        image.rename(image.with_stem(f"{int(image.stem) - 1:06d}"))
+    with pytest.raises(UserError, match="images from 0, and its annotations count frames from 1"):
+        open_dataset(f"mot:{tmp_path}")
+    truth.write_text("1,1,.2,.2,.1,.1,1,1,1\n")
+    with pytest.raises(UserError, match=r"gt\.txt has boxes of 0 to 1"):
         open_dataset(f"mot:{tmp_path}")
 
 

@@ -217,12 +217,12 @@ def test_a_picture_that_was_labelled_as_it_lies_is_read_so(tmp_path: Path) -> No
     assert image.shape == (200, 100, 3)
 
 
-@pytest.mark.parametrize("form", ["coco", "voc"])
-def test_a_picture_that_was_resized_has_its_boxes_scaled(tmp_path: Path, form: str) -> None:
+@pytest.mark.parametrize("width", [200, "200", 200.0, None])
+def test_a_picture_that_was_resized_has_its_boxes_scaled(tmp_path: Path, width: object) -> None:
     """Boxes of the large picture on the small one: recall 0.0 without a word."""
     picture(tmp_path / "data/a.jpg", (100, 50))
-    if form == "coco":
-        text(tmp_path / "labels.json", coco(width=200, height=100))
+    if width:
+        text(tmp_path / "labels.json", coco(width=width, height=100))
     else:
         text(tmp_path / "data/a.xml", voc())
     ((one, labels),) = read(tmp_path)
@@ -247,7 +247,10 @@ def test_a_picture_that_is_not_there_is_called_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("shown", "labels"),
-    [("A.JPG", "A.TXT"), ("Images/a.jpg", "Labels/a.txt"), ("a.jpg", "a.jpg.txt"), ("a.JPEG", "A.XML")],
+    [
+        *(("A.JPG", "A.TXT"), ("Images/a.jpg", "Labels/a.txt"), ("a.jpg", "a.jpg.txt"), ("a.JPEG", "A.XML")),
+        ("\u00e9.jpg", "e\u0301.txt"),  # the second from macOS
+    ],
 )
 def test_names_of_other_case_are_found(tmp_path: Path, shown: str, labels: str) -> None:
     """A set from Windows was taken for pictures that nobody labelled."""
@@ -401,6 +404,43 @@ def test_a_yaml_may_lie_elsewhere_than_its_pictures(tmp_path: Path, said: str) -
     yaml = text(tmp_path / "settings/ours.yaml", said.format(data=tmp_path / "data") + "names: [car, bus]\n")
     ((_, labels),) = read(yaml)
     assert labels.class_names == ("bus",)
+
+
+def test_classes_that_count_from_1_are_refused(tmp_path: Path) -> None:
+    """Each object would be of the next class, but for the last class, whose objects would be left out."""
+    picture(tmp_path / "a.jpg")
+    text(tmp_path / "a.txt", ROW + ROW.replace("1", "2", 1))
+    text(tmp_path / "classes.txt", "car\nbus\n")
+    with pytest.raises(
+        UserError, match=r"line 2 has class 2; there are 2, .* none is of class 0: count classes"
+    ):
+        doubts_of([one for one, _ in read(tmp_path)])
+    text(tmp_path / "a.txt", ROW + ROW.replace("1", "2", 1) + ROW.replace("1", "0", 1))
+    assert "1 labels were left out" in doubts_of([one for one, _ in read(tmp_path)])[0]
+
+
+def test_boxes_that_are_shares_where_pixels_are_expected_are_refused(tmp_path: Path) -> None:
+    """Every object would be a third of a pixel large."""
+    picture(tmp_path / "a.jpg")
+    text(tmp_path / "a.xml", voc().replace(">20<", ">.1<").replace(">10<", ">.1<").replace(">60<", ">.6<"))
+    assert read(tmp_path)
+    text(tmp_path / "a.xml", (tmp_path / "a.xml").read_text().replace(">80<", ">.4<"))
+    with pytest.raises(UserError, match="has boxes of 0 to 1"):
+        read(tmp_path)
+
+
+def test_what_coco_says_of_classes_and_crowds_counts(tmp_path: Path) -> None:
+    """An object would have the second of two names of its class, or be a "None", and ignored ones missed."""
+    picture(tmp_path / "a.jpg")
+    about = json.loads(coco(box=[100, 10, 20, 20]))
+    about["annotations"][1]["ignore"] = 1
+    about["categories"] += [{"id": 7, "name": None}, {"id": 8, "name": "car"}, {"id": 8, "name": "van"}]
+    about["annotations"] += [{**about["annotations"][0], "id": kind, "category_id": kind} for kind in (7, 8)]
+    text(tmp_path / "labels.json", json.dumps(about))
+    ((one, labels),) = read(tmp_path)
+    assert labels.class_names == ("bus",)
+    assert labels.ignored_xyxy_px.tolist() == [[100, 10, 120, 30]]
+    assert "2 labels were left out" in doubts_of([one])[0]
 
 
 def test_a_box_that_stands_there_twice_is_one(tmp_path: Path) -> None:

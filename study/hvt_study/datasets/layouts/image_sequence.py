@@ -68,14 +68,17 @@ class ImageSequence:
     ) -> Sequence:
         """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown.
 
-        Raises `UserError` where labels count frames from 0 and images from 1: all labels would be a frame late.
+        Raises `UserError` where labels count frames from 0 and images from 1, or the reverse: all labels would be a
+        frame late, or early.
         """
         frame_count = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
         known = None if labels is None else labels.table()
-        if known is not None and known.first_frame == 0 and self.first_number == 1:
+        first, last = (None, 0) if known is None else (known.first_frame, known.last_frame)
+        late = first == 0 and self.first_number == 1
+        if late or (first and self.first_number == 0 and last == self.frame_count):
             raise UserError(
-                f"sequence folder {self.folder} counts its images from 1, and its annotations count frames from 0: "
-                "number them alike"
+                f"sequence folder {self.folder} counts its images from {self.first_number}, and its annotations count"
+                f" frames from {1 - self.first_number}: number them alike"
             )
         found = () if labels is None else (path for path in labels.arguments if isinstance(path, Path))
         return Sequence(
