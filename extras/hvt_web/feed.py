@@ -246,7 +246,7 @@ def _short(one: EdgeState, at_ns: int) -> str:
         _failure(part_words(part.part), part, at_ns) for part in session.edge_failed if part.part == "source"
     ]
     if session.total_bps is not None:
-        thin = "link too thin, " if one.link == "thin" else ""
+        thin = "link or machine too slow, " if one.link == "thin" else ""
         said.append(f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
     return ", ".join(said)
 

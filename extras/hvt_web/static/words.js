@@ -16,7 +16,7 @@
 export const LINK_WORDS = {
   waiting: "waiting for a keyframe",
   up: "link up",
-  thin: "the link does not carry all frames",
+  thin: "link or machine too slow for all frames",
   lost: "link lost",
   ended: "ended",
 };
