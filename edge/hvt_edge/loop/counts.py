@@ -191,9 +191,11 @@ class FrameCounts:
         | code | no | | | encoder |
         | code, to the store | yes | no | | link |
         | code, to the link | yes | no | | budget |
-        | code, to the store | yes | yes | | stored |
+        | code, to the store alone | yes | yes | | stored |
         | code, to the link | yes | yes | yes | sent |
         | code, to the link | yes | yes | no | nobody_listened |
+
+        A probe of an outage goes to both, and counts as sent: no ground receives more frames than were sent.
         """
         group: FrameGroup = "sent" if has_viewer else "nobody_listened"
         if decision.action is Action.SKIP:
@@ -204,7 +206,7 @@ class FrameCounts:
             group = "encoder"
         elif not taken:
             group = "link" if decision.to_store else "budget"
-        elif decision.to_store:
+        elif decision.to_store and not decision.to_link:
             group = "stored"
         self.groups[group] += 1
 

@@ -172,7 +172,7 @@ def test_every_source_frame_is_in_one_group(steps, source, decimation):
         (FrameDecision(Action.CODE, to_link=True), {"coded": True}, "sent"),
         (FrameDecision(Action.CODE, to_link=True), {"coded": True, "has_viewer": False}, "nobody_listened"),
         (FrameDecision(Action.CODE, to_store=True), {"coded": True, "has_viewer": False}, "stored"),
-        (FrameDecision(Action.CODE, to_store=True, to_link=True), {"coded": True}, "stored"),
+        (FrameDecision(Action.CODE, to_store=True, to_link=True), {"coded": True}, "sent"),
         (FrameDecision(Action.CODE, to_store=True), {"coded": True, "taken": False}, "link"),
     ],
 )
