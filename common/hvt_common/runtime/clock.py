@@ -16,8 +16,13 @@ _CHECK_INTERVAL_NS = 1_000_000_000
 _FAR_NS = 10_000_000_000
 
 
+def since_boot_ns() -> int:
+    """Nanoseconds since this boot, those included in which the machine slept."""
+    return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
 class SteadyClock:
-    """Unix time that never steps: the wall clock at the start, advanced by the monotonic clock.
+    """Unix time that never steps: the wall clock at the start, advanced by the time that has passed, sleep included.
 
     A machine without a battery for its clock starts with an old date, and NTP sets it in flight. All times that HVT
     records, sends or compares are of such a clock, so that a step of the wall clock is neither a gap nor a delay. A
@@ -28,7 +33,7 @@ class SteadyClock:
         self,
         *,
         wall_ns: Callable[[], int] = time.time_ns,
-        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+        monotonic_ns: Callable[[], int] = since_boot_ns,
     ) -> None:
         self._wall_ns = wall_ns
         self._monotonic_ns = monotonic_ns
@@ -49,8 +54,8 @@ class SteadyClock:
         if abs(off_ns) > _FAR_NS:
             self._next_check_ns = None
             _log.warning(
-                "the clock of this machine was set by %+.0f s (or it slept): all times go on as if it had not been, "
-                "until the next start",
+                "the clock of this machine was set by %+.0f s: all times go on as if it had not been, until the next "
+                "start",
                 off_ns / 1e9,
             )
 
@@ -72,11 +77,6 @@ def boot_id() -> str:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
         return uuid4().hex
-
-
-def since_boot_ns() -> int:
-    """Nanoseconds since this boot, those included in which the machine slept."""
-    return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 def unwitnessed_ns(before: Moment, now: Moment, *, most_ns: int) -> int:

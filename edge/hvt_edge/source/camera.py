@@ -42,8 +42,6 @@ class CameraGrabber:
         self._fps = fps
         self._clock = clock
         self._capture: cv2.VideoCapture | None = None
-        self._ahead_ns = 0
-        """Of ``clock`` before the monotonic clock, when the device was opened."""
 
     def open(self) -> None:
         """Open the device. Raises `UserError` if it is missing, no camera, busy or not permitted."""
@@ -70,7 +68,6 @@ class CameraGrabber:
         if self._deep:
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         self._capture = capture
-        self._ahead_ns = self._clock() - time.monotonic_ns()
 
     def restart(self) -> None:
         self.close()
@@ -91,9 +88,9 @@ class CameraGrabber:
             shape = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
             return self._stretch.bgr(_levels(image, shape), at_s=time.monotonic())
 
-        # The driver stamps its buffers by the monotonic clock; where it does not, this is 0.
-        buffer_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
-        return Shot(image, self._ahead_ns + round(buffer_ms * 1e6) if buffer_ms > 0 else None)
+        # The driver stamps its buffers by the monotonic clock, which stands while the machine sleeps; or by none: 0.
+        buffer_ms, ahead_ns = capture.get(cv2.CAP_PROP_POS_MSEC), self._clock() - time.monotonic_ns()
+        return Shot(image, ahead_ns + round(buffer_ms * 1e6) if buffer_ms > 0 else None)
 
     def close(self) -> None:
         if self._capture is not None:

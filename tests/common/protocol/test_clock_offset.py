@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -131,3 +132,12 @@ def test_a_wall_clock_that_is_set_leaves_no_step():
         monotonic[0] += 40 * MS
         shown.append(clock())
     assert shown == [(1_000_000 + 40 * step) * MS for step in range(4)]
+
+
+def test_a_machine_that_slept_has_the_time_of_day(monkeypatch):
+    """A ground whose lid was shut between two flights would date the second hours before it took place."""
+    passed_ms = 5_000
+    monkeypatch.setattr(time, "clock_gettime_ns", lambda _clock: passed_ms * MS)
+    clock = SteadyClock(wall_ns=lambda: (995_000 + passed_ms) * MS)
+    passed_ms += 3_600_000
+    assert clock() == (995_000 + passed_ms) * MS
