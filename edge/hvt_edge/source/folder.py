@@ -29,12 +29,18 @@ _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
 def sequence_files(folder: Path) -> list[Path]:
     """The images of a folder in natural order (img2 before img10); hidden files and subfolders are not looked at.
 
-    Raises `UserError` for a folder that may not be read.
+    Of names that are times 9.05 comes before 9.5. Raises `UserError` for a folder that may not be read.
     """
     try:
         files = [file for file in folder.iterdir() if names_picture(file) and file.is_file()]
     except OSError as error:
         raise UserError(f"source folder {str(folder)!r} cannot be read ({error.strerror})") from None
+    times = [re.fullmatch(r"(.*?)([0-9]+)\.([0-9]+)", file.stem) for file in files]
+    found = [(one[1], int(one[2]), one[3]) for one in times if one]
+    least = min((len(fraction) for *_, fraction in found), default=0)
+    # A counter behind the dot has as many digits always where one has a zero before it.
+    if len(found) == len(files) and any(one[0] == "0" and len(one) > least for *_, one in found):
+        return [file for _, file in sorted(zip(found, files, strict=True))]
     return sorted(files, key=lambda file: _natural(file.name))
 
 
