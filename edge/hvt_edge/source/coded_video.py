@@ -12,6 +12,7 @@ from hvt_common.units import SECOND_NS, exact_rate
 from hvt_common.values import Frame
 from hvt_edge.source.camera_stream import (
     LONG_STEP_S,
+    REENCODE,
     CameraDecoder,
     CameraUnits,
     check_picture,
@@ -47,6 +48,8 @@ class CodedVideoSource(ClipSource):
     def __init__(self, spec: str, settings: SourceSettings) -> None:
         self._spec, self._name = spec, name_of(spec)
         self._limit, self._growing = settings.max_frames, settings.growing
+        self._hidden = 0
+        """Pictures that a player does not show."""
         notes = Notes(self._name)
         container, stream = open_video(spec, growing=self._growing, note=notes)
         with container:
@@ -73,6 +76,11 @@ class CodedVideoSource(ClipSource):
                 source = "as the stream itself says" if said_rate(stream) else "which is a guess"
                 notes(
                     f"it has no time stamps: {said:.4g} frames a second, {source}; --source-fps N says another"
+                )
+            if self._hidden:
+                notes(
+                    f"its edit list hides {self._hidden} of its pictures, and --encoder passthrough sends all: times"
+                    f" and poses count from the first of them; {REENCODE} to leave them out"
                 )
         self.notes = notes.taken()
         self.camera_stream = CameraStream(without_jumps(seen), self.fps)
@@ -112,6 +120,7 @@ class CodedVideoSource(ClipSource):
         for packet in packets_of(container, stream):
             if isinstance(packet, Exception) or not packet.size:  # what breaks off is played up to there
                 continue
+            self._hidden += packet.is_discard
             usable = self._stamps.usable and packet.pts is not None
             yield float(timeline.at(packet.pts * packet.time_base if usable else None)), bytes(packet)
         if say and (sentence := timeline.says):
