@@ -36,8 +36,11 @@ _CONVERTED = (1, 4, 5, 6, 7, 9)
 _MOST_ASPECT = 8
 _Turn = tuple[bool, bool, bool]
 """Whether rows become columns, and whether it is then mirrored left to right, and upside down."""
+_UPRIGHT = (False, False, False)
+_WITH_SEI = frozenset({"h264", "hevc"})
+"""Codecs that say a turn by a message at a keyframe, which holds for the pictures that follow (H.274, 8.9)."""
 _TURNS = {
-    (False, False, False): "",
+    _UPRIGHT: "",
     (False, True, False): "mirrored left to right",
     (False, False, True): "mirrored upside down",
     (False, True, True): "turned by 180 degrees",
@@ -57,6 +60,12 @@ class Pictures:
         """Kept: the table of an HDR picture takes seconds to make."""
         self._stretch = Stretch(notes)
         self._aspect = Fraction(1)
+        """Width of a pixel over its height, as the container says, or the film at its beginning."""
+        self._aspects: dict[tuple[int, int], Fraction] = {}
+        """The newest of pictures of a (width, height)."""
+        self._coded_aspect: Fraction | None = None
+        self._held_turn: _Turn | None = None
+        """The newest that the film itself said."""
         self._graph: Graph | None = None
         self._shape: tuple[int, int, str] | None = None
         """(width, height, format) for which the graph was made."""
@@ -64,22 +73,38 @@ class Pictures:
 
     def begin(self, stream: Any) -> None:
         """Read ``stream`` from here on; the container's word on its pixels goes before the codec's."""
-        self._stream, self._graph = stream, None
-        aspect = Fraction(stream.sample_aspect_ratio or 1)
+        self._stream, self._graph, self._held_turn = stream, None, None
+        self._aspects, self._coded_aspect = {}, None
+        self._aspect = self._checked_aspect(stream.sample_aspect_ratio)
+
+    def _checked_aspect(self, said: Fraction | None) -> Fraction:
+        aspect = Fraction(said or 1)
         if not Fraction(1, _MOST_ASPECT) <= aspect <= _MOST_ASPECT:
             self._say(
                 f"pixels {float(aspect):g} times as wide as high are taken for a fault: they are square"
             )
-            aspect = Fraction(1)
-        self._aspect = aspect
+            return Fraction(1)
         if aspect != 1:
             self._say(f"its pixels are {float(aspect):.3g} times as wide as high: made square")
+        return aspect
+
+    def _note(self, frame: av.VideoFrame) -> None:
+        # A film may say in its midst how it is to be shown, and says it of what follows.
+        codec = self._stream.codec_context
+        coded = codec.sample_aspect_ratio or Fraction(1)
+        self._coded_aspect = self._coded_aspect or coded
+        changed = coded != self._coded_aspect
+        self._aspects[frame.width, frame.height] = self._checked_aspect(coded) if changed else self._aspect
+        if codec.name in _WITH_SEI:
+            self._held_turn = _turn_of(frame) or self._held_turn
 
     def frames(self, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame]:
         """The picture of a decoded frame: deinterlaced, and then one frame later; None at the end.
 
         Frames of interlaced film are interpolated in time (bwdif); others pass as they are.
         """
+        if frame is not None:
+            self._note(frame)
         if frame is not None and not frame.interlaced_frame and self._graph is None:
             yield frame
             return
@@ -96,9 +121,10 @@ class Pictures:
     def bgr(self, frame: av.VideoFrame) -> Image:
         """(height, width, 3) uint8, with square pixels, turned and mirrored as the display matrix says."""
         picture = self._upright_colours(frame)
-        if said := turn_of(frame):
+        turn = _turn_of(frame) or self._held_turn or _UPRIGHT
+        if said := _TURNS[turn]:
             self._say(f"it is to be shown {said}, and is")
-            picture = _turned(picture, _turn_of(frame))
+            picture = _turned(picture, turn)
         return np.ascontiguousarray(picture)
 
     def _upright_colours(self, frame: av.VideoFrame) -> Image:
@@ -109,7 +135,8 @@ class Pictures:
                 frame, width=wide, height=high, format="gray16le", threads=1
             ).to_ndarray()
             bits = components[0].bits
-            return self._stretch.bgr(np.asarray(levels, np.uint16), at_s=frame.time or 0.0, bits=bits)
+            own = np.asarray(levels, np.uint16) >> (16 - bits)
+            return self._stretch.bgr(own, at_s=frame.time or 0.0, bits=bits)
         more: dict[str, Any] = {}
         if not frame.format.is_rgb and not name.startswith("gray"):
             if frame.colorspace not in _CONVERTED:
@@ -130,9 +157,10 @@ class Pictures:
 
     def _square(self, frame: av.VideoFrame) -> tuple[int, int]:
         # (width, height) with square pixels: one side grows, so that no detail is lost.
-        if self._aspect >= 1:
-            return max(2, round(frame.width * self._aspect)), frame.height
-        return frame.width, max(2, round(frame.height / self._aspect))
+        aspect = self._aspects.get((frame.width, frame.height), self._aspect)
+        if aspect >= 1:
+            return max(2, round(frame.width * aspect)), frame.height
+        return frame.width, max(2, round(frame.height / aspect))
 
     @staticmethod
     def _shape_of(frame: av.VideoFrame) -> tuple[int, int, str]:
@@ -172,17 +200,17 @@ def matrix_of(frame: av.VideoFrame) -> int:
 
 def turn_of(frame: av.VideoFrame) -> str:
     """The turn of a frame by its display matrix, to the nearest right angle, in words; empty for as it is."""
-    return _TURNS[_turn_of(frame)]
+    return _TURNS[_turn_of(frame) or _UPRIGHT]
 
 
-def _turn_of(frame: av.VideoFrame) -> _Turn:
-    # The turn by the display matrix (ISO/IEC 14496-12, 8.3.2).
+def _turn_of(frame: av.VideoFrame) -> _Turn | None:
+    # The turn by the display matrix (ISO/IEC 14496-12, 8.3.2); None without one.
     # Not `frame.side_data`: that holds the frame which holds it, and each picture would stay until Python looks for
     # such circles, a hundred megabytes later.
     container: Any = SideDataContainer
     said = container(frame).get("DISPLAYMATRIX")
     if said is None:
-        return False, False, False
+        return None
     matrix = np.frombuffer(bytes(said), np.int32)
     a, b, c, d = (int(matrix[place]) for place in (0, 1, 3, 4))
     if abs(b) + abs(c) > abs(a) + abs(d):
