@@ -16,7 +16,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_common.units import SECOND_NS
 from hvt_edge.source.contract import Notes
-from hvt_edge.source.decoding.container import cause_of, choose_stream, is_local
+from hvt_edge.source.decoding.container import DEMUX_OPTIONS, cause_of, choose_stream, is_local
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 
@@ -35,6 +35,7 @@ _NEVER = (
 _STAMPED = frozenset({"mpegts", "rtsp", "rtp", "sdp", "flv"})
 """Formats whose time stamps are the sender's; of pictures in a row FFmpeg invents them."""
 _OPTIONS = {
+    **DEMUX_OPTIONS,
     "rtsp_transport": "tcp",  # over UDP a camera's keyframes lose packets on the first busy switch
     "fflags": "nobuffer",
     "flags": "low_delay",

@@ -115,7 +115,7 @@ class VideoSource(ClipSource):
             why = "it has no time stamps" if without_stamps(stream) else "its time stamps do not rise"
             said = "as the stream itself says" if said_rate(stream) else "which is a guess"
             yield f"{why}: {fps:.4g} frames a second, {said}; --source-fps N says another rate"
-        elif not self._stamps.ordered and stream.container.format.name == "avi":
+        elif stream.container.format.name == "avi" and stream.codec_context.has_b_frames:
             yield "AVI has time stamps of the decoding alone: the n-th frame of the film is shown at the n-th of them"
 
     def _duration_s(self, stream: Any) -> Fraction | None:

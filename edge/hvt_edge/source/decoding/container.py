@@ -42,6 +42,10 @@ _SURVEYED = 256
 QUIET_S, _POLL_S = 10.0, 0.1
 """A file that has not grown for so long has ended."""
 _MOST_BOXES = 64
+DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
+"""A sender of MPEG-TS that begins anew may number its film otherwise: it is the same film to a viewer."""
+_WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
+"""Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
 _TS_BYTES = (188, 192, 204)
 """Size of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
 
@@ -92,7 +96,8 @@ def open_video(
             raise UserError(f"source {spec!r} is an empty file; accepted is a video file")
         # By its own name a file may look like an address.
         where: Any = f"file:{spec}" if local else spec
-        container = av.open(_GrowingFile(spec) if local and growing else where, timeout=(_OPEN_S, _READ_S))
+        file = _GrowingFile(spec) if local and growing else where
+        container = av.open(file, options=DEMUX_OPTIONS, timeout=(_OPEN_S, _READ_S))
     except (av.error.FFmpegError, OSError, ValueError) as error:
         unfinished = _lacks_index(Path(spec)) if local else ""
         raise refusal(
@@ -189,7 +194,9 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
         return Stamps(1 / (rate or Fraction(25)), usable=False), first
     reorders = bool(stream.codec_context.has_b_frames)
     stamps = surveyed(times, said_fps=rate, reorders=reorders)
-    return replace(stamps, long_s=LONG_STEP_S if container.format.flags & _MAY_JUMP else LONG_PAUSE_S), first
+    long_s = LONG_STEP_S if container.format.flags & _MAY_JUMP else LONG_PAUSE_S
+    # Those of the presentation in AVI are FFmpeg's guess, wrong by where frames were dropped, or two lie in a packet.
+    return replace(stamps, ordered=stamps.ordered and container.format.name != "avi", long_s=long_s), first
 
 
 def decoded(
@@ -228,6 +235,7 @@ class _Reading:
         self._damaged = self._shown_damaged = self._count = 0
         self._ended = ""
         self._end_s: Fraction | None = None
+        self._end_byte = 0
 
     def frames(self) -> Iterator[av.VideoFrame]:
         for packet in packets_of(self._container, self._stream):
@@ -235,6 +243,7 @@ class _Reading:
                 self._ended = f"it breaks off ({cause_of(packet)})"
             else:
                 self._count += bool(packet.size)  # what an edit list hides is there too
+                self._end_byte = max(self._end_byte, (packet.pos or 0) + packet.size)
                 # By its own time: of decoding, the last of B-frames lies whole frames before it.
                 stamp = packet.dts if packet.pts is None else packet.pts
                 if stamp is not None:
@@ -264,10 +273,11 @@ class _Reading:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
         if self._ends_in_fragment():
             return "its last fragment is cut"
-        if self._count < stream.frames and (self._lacks_bytes() or self._count < 0.98 * stream.frames - 2):
-            return f"{self._count} of its {stream.frames} frames are there"
-        if container.format.name == "mpegts":
-            return "its last packet is cut" if all((self._size or 0) % one for one in _TS_BYTES) else ""
+        count = self._frames_there()
+        if count < stream.frames and (self._lacks_bytes() or count < 0.98 * stream.frames - 2):
+            return f"{count} of its {stream.frames} frames are there"
+        if (why := self._lacks_pictures()) or container.format.name == "mpegts":
+            return why
         begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
         # That of the container may be that of the sound.
         said_s = duration_s(stream) if stream.duration or len(container.streams) == 1 else None
@@ -276,6 +286,21 @@ class _Reading:
             if missing_s > 1 and missing_s > said_s / 50:
                 return f"it ends {float(missing_s):.1f} s before the end that its header says"
         return ""
+
+    def _frames_there(self) -> int:
+        if self._container.format.name != "avi":
+            return self._count
+        # With those that its recorder dropped, as the places of the others say.
+        return max(self._count, math.ceil((self._end_s or 0) * (self._stream.average_rate or 0)))
+
+    def _lacks_pictures(self) -> str:
+        # The same of formats without an index, by their bytes.
+        name, size = self._container.format.name, self._size or 0
+        behind = 1 - self._end_byte / size if size and name in _WITHOUT_INDEX else 0
+        if behind > _MOST_BEHIND:
+            return f"its last {behind:.0%} hold nothing of this film, but perhaps another recording"
+        broken = name == "mpegts" and all(size % one for one in _TS_BYTES)
+        return "its last packet is cut" if broken else ""
 
     def _ends_in_fragment(self) -> bool:
         # Whether an MP4 in fragments, which counts no frames, ends within one.
@@ -294,7 +319,10 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
     while True:
         try:
             packet = next(packets)
-        except StopIteration:
+        except (
+            StopIteration,
+            IndexError,
+        ):  # the second where another stream began: PyAV has none of its number
             return
         except av.error.FFmpegError as error:
             yield error

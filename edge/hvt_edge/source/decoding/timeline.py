@@ -76,8 +76,9 @@ class Timeline:
     def __init__(
         self, period_s: Fraction, *, quantum_s: Fraction | None = None, long_s: Fraction = LONG_STEP_S
     ) -> None:
-        # A mended step is one that the stamps can say, whole ones, as those around it.
-        self._period_s = period_s if not quantum_s else math.ceil(period_s / quantum_s) * quantum_s
+        # A mended step is one that the stamps can say, whole ones, as those around it; a frame that came a little
+        # late would be passed over at the next instant of the base.
+        self._period_s = period_s if not quantum_s else max(1, math.floor(period_s / quantum_s)) * quantum_s
         self._most_s = max(long_s, _LONG_STEPS * period_s)
         self._stamp_s: Fraction | None = None
         self._at_s: Fraction | None = None

@@ -1,0 +1,99 @@
+"""Clips that change in their midst: recordings put together, frames that a recorder dropped, a film turned."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import av
+import pytest
+
+from hvt_edge.source.opening import open_source
+from media.numbered import disc, number_of, numbered, patch, write_numbered
+
+
+def play(spec):
+    """Its pictures, each as often as it is shown, at 30 frames a second."""
+    with open_source(str(spec), size=lambda size: size, fps=30.0) as source:
+        return [frame.source_bgr for frame in source.frames(start_ns=0)]
+
+
+def put_together(tmp_path, ending, *, settings=({}, {}), setups=(lambda _: None, lambda _: None)):
+    """Frames 0 to 59 and 60 to 119, each half with its muxer's settings, in one file."""
+    parts = []
+    for turn in range(2):
+        part = tmp_path / f"{turn}.{ending}"
+        with av.open(str(part), "w", container_options=settings[turn]) as container:
+            stream = container.add_stream("libx264", rate=30, options={"bf": "0", "g": "15"})
+            stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+            setups[turn](stream)
+            for number in range(60 * turn, 60 * turn + 60):
+                frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24")
+                container.mux(stream.encode(frame.reformat(format="yuv420p")))
+            container.mux(stream.encode(None))
+        parts.append(part.read_bytes())
+    both = tmp_path / f"both.{ending}"
+    both.write_bytes(b"".join(parts))
+    return both
+
+
+def test_two_recordings_play_whole_where_time_begins_anew(tmp_path, caplog):
+    """The first of two would be lost; of the second each third frame was, as Matroska has whole milliseconds."""
+    for ending in ("ts", "mkv"):
+        assert [number_of(one) for one in play(put_together(tmp_path, ending))] == list(range(120))
+        assert f"both.{ending}: its time stamps jump by -1.967 s" in caplog.text
+
+
+def test_a_film_that_goes_on_under_another_number_is_the_same(tmp_path):
+    """A sender that begins anew may number its streams otherwise (mpv#4305): the rest was not shown."""
+    clip = put_together(tmp_path, "ts", settings=({}, {"mpegts_start_pid": "512"}))
+    assert {*range(59), *range(60, 120)} <= {number_of(one) for one in play(clip)}
+
+
+@pytest.mark.parametrize(("ending", "options"), [("ts", {"mpegts_pmt_start_pid": "4200"}), ("flv", {})])
+def test_a_recording_behind_the_film_is_said(tmp_path, caplog, ending, options):
+    """FFmpeg ends with the first: half of a file was lost without a word, or the edge ended in a traceback."""
+    clip = put_together(
+        tmp_path, ending, settings=({}, {**options, "mpegts_start_pid": "512"} if options else {})
+    )
+    assert [number_of(one) for one in play(clip)] == list(range(60))
+    assert "hold nothing of this film, but perhaps another recording" in caplog.text
+
+
+def test_pixels_are_made_square_when_their_shape_changes_too(tmp_path):
+    """Who puts 4:3 and 16:9 together would see all that follows too wide by a third."""
+
+    def wide(stream):
+        stream.codec_context.sample_aspect_ratio = Fraction(16, 11)
+
+    pictures = play(put_together(tmp_path, "ts", setups=(wide, lambda _: None)))
+    for place, aspect in ((10, 16 / 11), (100, 1)):
+        across, down = disc(pictures[place])
+        assert across == pytest.approx(aspect * down, rel=0.03)
+
+
+def test_a_turn_that_a_keyframe_says_holds_up_to_the_next(tmp_path):
+    """One picture in each group would be turned, and the others not."""
+    clip = write_numbered(tmp_path / "a.h264", 9, bf="0")
+    nals = clip.read_bytes().split(b"\0\0\1")
+    # SEI 47, display orientation: not cancelled, mirrored left to right, no turn, until the next (H.264, D.1.27).
+    message = b"\x06\x2f\x03\x40\x00\x18\x80"
+    first = next(place for place, one in enumerate(nals) if one[:1] and one[0] & 31 == 5)
+    clip.write_bytes(b"\0\0\1".join([*nals[:first], message, *nals[first:]]))
+    assert {patch(one, right=True)[2] > 150 for one in play(clip)} == {True}
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "libx264"])
+def test_a_frame_that_a_recorder_dropped_keeps_its_place(tmp_path, caplog, codec):
+    """AVI has an empty one there: it was called unfinished, and of H.264 the frame before came too late."""
+    taken = [one for one in range(30) if one not in {5, 6, 7}]
+    with av.open(str(tmp_path / "a.avi"), "w") as container:
+        stream = container.add_stream(codec, rate=30, options={"bf": "0", "g": "1"})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for number in taken:
+            frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24").reformat(format="yuv420p")
+            frame.pts, frame.time_base = number, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    shown = [number_of(one) for one in play(tmp_path / "a.avi")]
+    assert shown == [max(one for one in taken if one <= place) for place in range(30)]
+    assert "unfinished" not in caplog.text
