@@ -99,8 +99,10 @@ class StreamGrabber:
         container = _open(self._url, open_s=self._open_s, read_s=self._read_s)
         stream = self._choose(container)
         if stream is None:
+            may_come = not container.duration  # a camera that boots describes itself before its encoder runs
             container.close()
-            raise UserError(f"source {self.name} holds no video stream")
+            kind = NotYetError if may_come else UserError
+            raise kind(f"source {self.name} holds no video stream")
         try:
             shots = self._read(container, stream)
         except UserError:
@@ -191,12 +193,15 @@ def _open(url: str, *, open_s: float, read_s: float) -> Any:
         if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("http"):
             # A camera's JPEGs without the boundary before the first: FFmpeg finds them by their own beginnings.
             with suppress(av.error.FFmpegError, OSError):
-                return _pictures_of(av.open(url, format="mjpeg", **how))
+                return _pictures_of(av.open(url, format="mjpeg", **how), name)
     raise kind(f"source {name} cannot be opened within {open_s:g} s ({cause}){_spelt(url)}")
 
 
-def _pictures_of(container: Any) -> Any:
+def _pictures_of(container: Any, name: str) -> Any:
     # The same, if it holds pictures; raises `OSError` where anything else was taken for some.
+    if container.size == 0:
+        container.close()
+        raise NotYetError(f"source {name} is empty so far")
     codec = next(iter(container.streams.video)).codec_context
     if codec.width and codec.height:
         return container

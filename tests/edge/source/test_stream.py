@@ -68,6 +68,22 @@ def test_a_camera_that_is_as_slow_as_was_asked_is_not_gone(monkeypatch, fps, wai
     assert waited == [pytest.approx(waits_s)]
 
 
+@pytest.mark.parametrize(
+    ("address", "says"), [("rtsp://camera", "holds no video"), ("http://camera", "is empty so far")]
+)
+def test_a_camera_that_has_no_picture_yet_is_waited_for(monkeypatch, address, says):
+    """One that boots describes no stream, or answers with nothing: the edge ended with code 2, for good."""
+
+    def answer(_url, *, format=None, **_settings):  # noqa: A002 - as PyAV has it
+        if address.startswith("http") and format is None:
+            raise av.error.InvalidDataError(1094995529, "Invalid data found when processing input")
+        return SimpleNamespace(streams=SimpleNamespace(video=()), duration=None, size=0, close=lambda: None)
+
+    monkeypatch.setattr(av, "open", answer)
+    with pytest.raises(NotYetError, match=says):
+        open_source(address, size=(320, 180), fps=15)
+
+
 def test_a_camera_has_as_long_when_it_is_opened_again(monkeypatch):
     """With a keyframe each 2 s one by UDP, back after a pause, was not opened within 2.5 s, and again and again."""
     opened, films = [], [av.open(film_that_stops()) for _ in range(2)]
