@@ -142,7 +142,6 @@ class Session:
         reference_ns = item.received_ns if self.lockstep else None
         if reception.knows_delay:
             reference_ns = reception.capture_clock.to_local_ns(header.capture_ns)
-        if reference_ns is not None:
             reception.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
         perceived = self.perceived

@@ -645,6 +645,7 @@ def test_the_summary_can_be_written_and_read():
     assert content["stills"]["dropped"] == 1
     assert content["stills"]["reasons"]["outcomes"] == {"unread": 1}
     assert content["latency_ms"]["p50"] is not None
+    assert content["receive_latency_ms"]["p50"] is None, "in lockstep it said 0"
     assert (content["edge"], content["method"], content["recording"]) == ("uav-1", "M5", None)
     content = completed(content, rig.receiver)
     assert content["unusable_messages"] == 0
