@@ -86,13 +86,14 @@ class WebPage(Service):
         self._failures = failures or Failures(clock)
         self._socket = Awaited(lambda: _bound(host, port), _PART, self._failures)
         self._stop = threading.Event()
-        shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
+        everywhere = host in ("0.0.0.0", "::")  # noqa: S104
+        shown = socket.gethostname() if everywhere else f"[{host}]" if ":" in host else host
         start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
         self.address = start if proxy is None else f"https://{proxy}/"
         """Without a token."""
         self.shown_to_others = "" if proxy is None and not tokens else self.address
         scheme = start.partition(":")[0]
-        others = [f"{scheme}://{one}:{port}/" for one in own_addresses()] if host == "0.0.0.0" else []  # noqa: S104
+        others = [f"{scheme}://{one}:{port}/" for one in own_addresses()] if everywhere else []
         by_token = tuple(
             " or ".join(f"{where}?token={token}" for where in (start, *others)) + f" ({role})"
             for role, token in tokens.items()

@@ -289,10 +289,11 @@ def test_a_viewer_commands_nothing(public, state_folder):
         assert status == expected
 
 
-def test_the_links_at_the_start_open_the_page(port, state_folder, monkeypatch):
+@pytest.mark.parametrize("host", ["0.0.0.0", "[::]"])
+def test_the_links_at_the_start_open_the_page(host, port, state_folder, monkeypatch):
     """Nobody would know the token."""
     monkeypatch.setattr(server, "own_addresses", lambda: ["10.8.0.1"])
-    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns) as page:
+    with WebPage(f"{host}:{port}", clock=time.time_ns) as page:
         tokens = json.loads((state_folder / "web-tokens.json").read_text())
         assert any(f"?token={tokens['operator']}" in one for one in page.links)
         assert len(page.links) == 2
