@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -57,6 +58,13 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
             raise UserError(
                 f"{name} {path} is neither a folder nor named {suffix}: give FILE{suffix} or a folder"
             )
+        elif path.exists() and not (os.access(path, os.W_OK | os.X_OK) or _is_read_only(path)):
+            raise UserError(f"{name} {path} cannot be written to by this user: give a folder that can")
+
+
+def _is_read_only(folder: Path) -> bool:
+    # A disk may be mended in flight; nobody changes whose a folder is.
+    return bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
 
 
 def make_folders(config: GroundConfig) -> None:
