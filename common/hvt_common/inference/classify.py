@@ -5,10 +5,11 @@ How pixels are prepared, first rule that applies:
 1. The model's metadata says it: ``hvt.mean`` and ``hvt.scale`` (one number or three, network value =
    (pixel - mean) * scale, pixels 0…255, numbers in the order of the network's channels) and ``hvt.channel_order``
    (``RGB`` or ``BGR``).
-2. The metadata say Ultralytics' classify (``author``, ``task``): RGB, pixel / 255.
-3. 1001 classes, TensorFlow's ImageNet with a background class: RGB, (pixel - 128) / 128.
-4. An OpenVINO model (``.xml``): BGR 0…255, as the Open Model Zoo takes them.
-5. Anything else, as torchvision and the ONNX model zoo train (ResNet-50): RGB, mean 123.675 116.28 103.53, scale
+2. The network's first steps subtract a mean or divide: plain pixels, 0…1 or 0…255 as these say.
+3. The metadata say Ultralytics' classify (``author``, ``task``): RGB, pixel / 255.
+4. 1001 classes, TensorFlow's ImageNet with a background class: RGB, (pixel - 128) / 128.
+5. An OpenVINO model (``.xml``): BGR 0…255, as the Open Model Zoo takes them.
+6. Anything else, as torchvision and the ONNX model zoo train (ResNet-50): RGB, mean 123.675 116.28 103.53, scale
    1/58.395 1/57.12 1/57.375. The last two are guesses, and are said.
 
 The crop is resized to the network's input as a whole, without keeping its shape. The usual "shorter side 256, centre
@@ -31,6 +32,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.labels import class_labels, first_synonym, read_labels
 from hvt_common.inference.letterbox import Preparation, as_bgr, prepared_as
+from hvt_common.inference.runtimes.first_steps import own_scaling
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.model_file import is_ir
 from hvt_common.inference.store import resolve_model
@@ -161,6 +163,8 @@ class OnnxClassifier:
                 )
             )
         row = rows[fitting[0]]
+        if any((rows[index].argmax(axis=1) != row.argmax(axis=1)).any() for index in fitting):
+            raise UserError(_not_a_classifier(self.model, "several outputs are scores, and not of the same"))
         sums_to_one = row[0].min() >= 0 and abs(row[0].sum() - 1) < 1e-2
         each = bool(np.isfinite(row).all() and row.min() >= 0 and row.max() <= 1)
         if each and not sums_to_one:
@@ -213,6 +217,9 @@ def _preparation(model: OnnxModel, classes: int) -> tuple[Preparation, str]:
         usual, why = _OPEN_MODEL_ZOO, "assumed, as the Open Model Zoo takes them"
     else:
         usual, why = Preparation.torchvision(), "assumed, as torchvision trains"
+    own = own_scaling(model.path)
+    if own is not None:
+        usual, why = usual.unless_scaled(own), "it scales them itself"
     if any(key.startswith("hvt.") for key in said):
         why = "its metadata say so"
     return prepared_as(model.path, said, usual), why

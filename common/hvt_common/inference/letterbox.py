@@ -29,6 +29,13 @@ class Preparation:
         """The preparation of torchvision and the ONNX model zoo for ImageNet."""
         return cls(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 / 57.12, 1 / 57.375))
 
+    def unless_scaled(self, own: tuple[int, bool | None] | None) -> Preparation:
+        """Plain pixels for a network that scales them itself (`own_scaling`); this for one that does not, as most."""
+        if own is None:
+            return self
+        top, red_first = own
+        return Preparation((0.0,) * 3, (top / 255,) * 3, rgb=self.rgb if red_first is None else red_first)
+
     def __str__(self) -> str:
         order = "RGB" if self.rgb else "BGR"
         mean, divisor = (

@@ -13,7 +13,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.runtimes.model import open_model
-from media.onnx_models import colour_classifier, colour_detector, constant_model
+from media.onnx_models import colour_classifier, colour_detector, constant_model, scaling_inside
 
 PLAIN = {"hvt.mean": "0", "hvt.scale": "[1]"}
 BLUE = np.full((20, 30, 3), (200, 100, 50), np.uint8)  # BGR
@@ -46,6 +46,30 @@ def test_pixels_are_prepared_by_the_documented_rule(
     """A wrong mean or colour order costs a third of the accuracy and looks like a bad model."""
     path = colour_classifier(tmp_path / "c.onnx", classes=classes, gain=1, metadata=metadata)
     np.testing.assert_allclose(scores(path, BLUE), expected - expected[2], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected"),
+    [
+        ([("Div", 255)], np.array([50, 100, 200]) / 255),
+        ([("Cast", None), ("Mul", 1 / 127.5), ("Sub", 1)], np.array([50, 100, 200]) / 127.5),
+        ([("Sub", 0.5), ("Div", 0.5)], np.array([50, 100, 200]) / 127.5),
+        (
+            [("Sub", [0.485, 0.456, 0.406]), ("Div", [0.229, 0.224, 0.225])],
+            (np.array([50, 100, 200]) / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225],
+        ),
+        (
+            [("Sub", [103.94, 116.78, 123.68]), ("Mul", 0.02)],
+            (np.array([200, 100, 50]) - [103.94, 116.78, 123.68]) * 0.02,
+        ),
+    ],
+)
+def test_a_network_that_scales_its_pixels_gets_them_plain(
+    tmp_path: Path, steps: list[tuple[str, object]], expected: np.ndarray
+) -> None:
+    """They would be scaled twice: each crop is black, and of one class."""
+    path = scaling_inside(colour_classifier(tmp_path / "c.onnx", classes=7, gain=1), steps)
+    np.testing.assert_allclose(scores(path, BLUE), expected - expected[2], atol=1e-3)
 
 
 @pytest.mark.parametrize("channels_last", [False, True])
@@ -231,3 +255,8 @@ def test_of_several_outputs_the_names_tell_which(tmp_path: Path) -> None:
     labels = tmp_path / "labels.txt"
     labels.write_text("car\nbus\nvan\n")
     assert open_classifier(str(path), labels=labels).classify([BLUE])[0].class_name == "van"
+    path = constant_model(tmp_path / "c.onnx", np.array([[0.1, 0.9]]), np.array([[0.8, 0.2]]))
+    with pytest.raises(UserError, match="several outputs are scores, and not of the same"):
+        open_classifier(str(path))
+    path = constant_model(tmp_path / "c.onnx", np.array([[0.1, 0.9]]), np.array([[-3, 5]]))
+    assert open_classifier(str(path)).classify([BLUE])[0].confidence == pytest.approx(0.9)

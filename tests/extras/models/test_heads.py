@@ -16,7 +16,7 @@ from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.model import open_model
 from media.head_models import FAMILIES, NEEDS_NAMES, SQUARES, Graph, family_model, picture
-from media.onnx_models import constant_model, save
+from media.onnx_models import constant_model, save, scaling_inside
 
 NAMED = {"names": "['red', 'blue']"}
 ULTRALYTICS = {**NAMED, "author": "Ultralytics", "task": "detect", "stride": "32", "imgsz": "[320, 320]"}
@@ -74,6 +74,12 @@ def test_channels_may_come_last(tmp_path: Path, family: str, dtype: int) -> None
     detector = opened(path)
     check(detector, FAMILIES[family][0])
     assert "channels last" in detector.pixels
+
+
+def test_a_network_that_divides_its_pixels_gets_them_whole(tmp_path: Path) -> None:
+    """They would be divided twice, and nothing found without a word."""
+    path = scaling_inside(family_model(tmp_path / "m.onnx", "yolov8"), [("Div", 255)])
+    check(opened(path), "yolov8")
 
 
 @pytest.mark.parametrize("channels_last", [False, True])

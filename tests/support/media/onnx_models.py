@@ -44,6 +44,29 @@ def save(
     return path
 
 
+def scaling_inside(path: Path, steps: Sequence[tuple[str, object]]) -> Path:
+    """The model with these operators between its (N, 3, H, W) input and what takes it now, each with its constant."""
+    model = onnx.load(path)
+    graph = model.graph
+    first = last = graph.input[0].name
+    nodes = []
+    for number, (kind, value) in enumerate(steps):
+        made, extra = f"scaled{number}", {"to": TensorProto.FLOAT} if kind == "Cast" else {}
+        inputs = [last] if value is None else [last, f"by{number}"]
+        if value is not None:
+            numbers = np.array(value, np.float32).reshape(-1, 1, 1)
+            graph.initializer.append(numpy_helper.from_array(numbers, f"by{number}"))
+        nodes.append(helper.make_node(kind, inputs, [made], **extra))
+        last = made
+    for node in graph.node:
+        node.input[:] = [last if name == first else name for name in node.input]
+    rest = list(graph.node)
+    del graph.node[:]
+    graph.node.extend([*nodes, *rest])
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
 def constant_model(
     path: Path,
     *outputs: np.ndarray,

@@ -13,6 +13,7 @@ import os
 import re
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree as ET
@@ -32,7 +33,7 @@ _EXTERNAL = 1
 # Field numbers of ModelProto in onnx.proto.
 _MODEL_FIELDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 14, 20, 25, 26})
 _VERSION_FIELD, _PRODUCER_FIELD, _PRODUCER_VERSION_FIELD = 1, 2, 3
-_GRAPH_FIELD = 7
+GRAPH_FIELD = 7
 _OPSET_FIELD = 8
 _METADATA_FIELD = 14
 # Fields of onnx.proto that lead to tensors: message → field number → message.
@@ -97,8 +98,8 @@ def onnx_metadata(path: Path) -> dict[str, str]:
 def _top_fields(path: Path) -> Iterator[tuple[int, int, bytes]]:
     # Number, value (of a varint) and bytes of the fields of a checked model, but for the graph, which is large.
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for field, _, value, begin, end in _fields(data, 0, len(data)):
-            if field != _GRAPH_FIELD:
+        for field, _, value, begin, end in fields_of(data, 0, len(data)):
+            if field != GRAPH_FIELD:
                 yield field, value, data[begin:end]
 
 
@@ -122,7 +123,7 @@ def _check(path: Path, data: mmap.mmap) -> None:
         location = _external_location(data, 0, len(data), "Model", depth=0)
     except ValueError as error:
         raise UserError(f"model {path} is not an ONNX file, or is cut short ({error})") from error
-    if _GRAPH_FIELD not in fields:
+    if GRAPH_FIELD not in fields:
         raise UserError(f"model {path} is not an ONNX file (no graph in it)")
     if location is not None:
         raise UserError(
@@ -132,7 +133,7 @@ def _check(path: Path, data: mmap.mmap) -> None:
 
 
 def _model_fields(data: _Bytes) -> Iterator[int]:
-    for field, wire_type, _, begin, _ in _fields(data, 0, len(data)):
+    for field, wire_type, _, begin, _ in fields_of(data, 0, len(data)):
         if field not in _MODEL_FIELDS or wire_type not in (0, 2):
             raise ValueError(f"unknown field {field} of type {wire_type} before byte {begin}")
         yield field
@@ -144,7 +145,7 @@ def _external_location(data: _Bytes, start: int, end: int, kind: str, *, depth: 
         raise ValueError(f"messages nested {depth} deep")
     if kind == "Tensor":
         return _tensor_location(data, start, end)
-    for field, wire_type, _, begin, stop in _fields(data, start, end):
+    for field, wire_type, _, begin, stop in fields_of(data, start, end):
         inner = _INSIDE[kind].get(field)
         if inner is not None and wire_type == 2:
             location = _external_location(data, begin, stop, inner, depth=depth + 1)
@@ -155,12 +156,12 @@ def _external_location(data: _Bytes, start: int, end: int, kind: str, *, depth: 
 
 def _tensor_location(data: _Bytes, start: int, end: int) -> str | None:
     external, location = False, ""
-    for field, wire_type, value, begin, stop in _fields(data, start, end):
+    for field, wire_type, value, begin, stop in fields_of(data, start, end):
         if field == _TENSOR_DATA_LOCATION and wire_type == 0:
             external = value == _EXTERNAL
         elif field == _TENSOR_EXTERNAL_DATA and wire_type == 2:
             external = True
-            entry = {number: data[a:b] for number, _, _, a, b in _fields(data, begin, stop)}
+            entry = {number: data[a:b] for number, _, _, a, b in fields_of(data, begin, stop)}
             if entry.get(1) == b"location":
                 location = entry.get(2, b"")[:200].decode(errors="replace")
     return location if external else None
@@ -169,7 +170,7 @@ def _tensor_location(data: _Bytes, start: int, end: int) -> str | None:
 def _opset(data: bytes) -> tuple[str, int]:
     # Decode an OperatorSetIdProto: domain is field 1, version field 2.
     domain, version = "", 0
-    for field, _, value, begin, end in _fields(data, 0, len(data)):
+    for field, _, value, begin, end in fields_of(data, 0, len(data)):
         if field == 1:
             domain = data[begin:end].decode(errors="replace")
         elif field == 2:
@@ -179,12 +180,12 @@ def _opset(data: bytes) -> tuple[str, int]:
 
 def _metadata_entry(data: bytes) -> tuple[str, str]:
     # Decode a StringStringEntryProto: key is field 1, value field 2.
-    entry = {field: data[begin:end] for field, _, _, begin, end in _fields(data, 0, len(data))}
+    entry = {field: data[begin:end] for field, _, _, begin, end in fields_of(data, 0, len(data))}
     key, value = (entry.get(field, b"").decode(errors="replace") for field in (1, 2))
     return key, value
 
 
-def _fields(data: _Bytes, start: int, end: int) -> Iterator[tuple[int, int, int, int, int]]:
+def fields_of(data: _Bytes, start: int, end: int) -> Iterator[tuple[int, int, int, int, int]]:
     # Number, wire type, value (of a varint), begin and end of each field of a message; ValueError if malformed.
     at = start
     while at < end:
@@ -255,6 +256,7 @@ def check_ir_file(path: Path) -> None:
 def ir_metadata(path: Path) -> dict[str, str]:
     """The ``model_info`` of an IR, names as in ONNX: ``names`` of the classes, and whatever else it says.
 
+    ``mean_values``, ``scale_values`` and ``reverse_input_channels``, of BGR pixels, become ``hvt.mean`` and so on.
     Ultralytics writes its own into ``metadata.yaml`` beside the file: its plain values and names are read too. Raises
     `UserError` as `check_ir_file` does.
     """
@@ -268,7 +270,21 @@ def ir_metadata(path: Path) -> dict[str, str]:
     labels = said.pop("labels", "").split()
     if labels and "names" not in metadata:
         metadata["names"] = repr([label.replace("_", " ") for label in labels])
-    return said | metadata
+    return _pixels_of_model_info(said) | said | metadata
+
+
+def _pixels_of_model_info(said: Mapping[str, str]) -> dict[str, str]:
+    found = {}
+    mean, divisors = (said.get(key, "").strip("[]() ") for key in ("mean_values", "scale_values"))
+    if mean or divisors:
+        found["hvt.mean"] = mean or "0"
+        with suppress(ValueError, ZeroDivisionError):  # what is no number is refused as it stands
+            divisors = " ".join(str(1 / float(one)) for one in (divisors or "1").replace(",", " ").split())
+        found["hvt.scale"] = divisors
+    if "reverse_input_channels" in said:
+        turned = said["reverse_input_channels"].lower() in ("yes", "true", "1")
+        found["hvt.channel_order"] = "RGB" if turned else "BGR"
+    return found
 
 
 def _yaml_of_ultralytics(path: Path) -> dict[str, str]:

@@ -22,7 +22,7 @@ from onnx import TensorProto, helper, numpy_helper
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes import model_file
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from hvt_common.inference.runtimes.model_file import MAX_MODEL_BYTES
+from hvt_common.inference.runtimes.model_file import MAX_MODEL_BYTES, ir_metadata
 from hvt_common.runtime.process import with_lower_priority
 from media.onnx_models import colour_detector, constant_model
 
@@ -373,3 +373,25 @@ def test_a_constant_that_would_fill_the_memory_is_not_made_when_the_model_is_ope
         check=True,
     )
     assert int(ended.stdout) < 1_500_000, "kilobytes; the constant alone would have 3.6 GB"
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ("", {}),
+        ('<scale_values value="255.0"/>', {"hvt.mean": "0", "hvt.scale": "0.00392156862745098"}),
+        (
+            '<mean_values value="[10, 20, 30]"/><scale_values value="2 4 5"/><reverse_input_channels value="YES"/>',
+            {"hvt.mean": "10, 20, 30", "hvt.scale": "0.5 0.25 0.2", "hvt.channel_order": "RGB"},
+        ),
+        ('<mean_values value="128"/>', {"hvt.mean": "128", "hvt.scale": "1.0"}),
+        ('<reverse_input_channels value="False"/>', {"hvt.channel_order": "BGR"}),
+        ('<scale_values value="0"/>', {"hvt.mean": "0", "hvt.scale": "0"}),
+    ],
+)
+def test_an_openvino_model_says_its_pixels(tmp_path: Path, said: str, expected: dict[str, str]) -> None:
+    """A network of Geti or DL Streamer would get other pixels than it was trained with, and find little."""
+    (tmp_path / "m.bin").write_bytes(b"")
+    (tmp_path / "m.xml").write_text(f"<net><rt_info><model_info>{said}</model_info></rt_info></net>")
+    found = ir_metadata(tmp_path / "m.xml")
+    assert {key: value for key, value in found.items() if key.startswith("hvt.")} == expected
