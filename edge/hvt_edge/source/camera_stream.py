@@ -264,6 +264,8 @@ def check_picture(name: str, picture: av.VideoFrame, *, size: BaseSize) -> str:
         raise UserError(
             f"source {name} is to be shown {turn}, and --encoder passthrough sends it as it is coded: {REENCODE}"
         )
+    if picture.interlaced_frame:
+        return f"source {name} is interlaced: grounds show its combs, unless you {REENCODE}"
     if picture.color_range == ColorRange.JPEG or matrix_of(picture) in _OTHER_MATRICES:
         return f"source {name} is not BT.709 in limited range: grounds show its colours a little off"
     return ""

@@ -135,12 +135,19 @@ def test_what_is_not_coded_is_refused(spec, kind):
         coded(spec)
 
 
-def test_colours_that_grounds_show_a_little_off_are_told_of(tmp_path):
-    """Who sees grey for black would look for the fault in the camera."""
-    with coded(write_clip(tmp_path / "a.mp4", more="range=full:colormatrix=bt709")) as source:
-        assert "is not BT.709 in limited range" in source.warning
-    with coded(write_clip(tmp_path / "b.mp4", more="range=limited:colormatrix=bt709")) as source:
-        assert source.warning == ""
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ("range=full:colormatrix=bt709", "is not BT.709 in limited range"),
+        ("interlace=tff", "is interlaced"),
+        ("range=limited:colormatrix=bt709", ""),
+    ],
+)
+def test_what_grounds_show_a_little_off_is_told_of(tmp_path, more, says):
+    """Who sees grey for black, or combs, would look for the fault in the camera."""
+    with coded(write_clip(tmp_path / "a.mp4", more=more)) as source:
+        assert says in source.warning
+        assert bool(says) == bool(source.warning)
 
 
 def jumping(clip: Path, *, ahead: bool) -> Path:
