@@ -17,19 +17,25 @@ def play(spec):
         return [frame.source_bgr for frame in source.frames(start_ns=0)]
 
 
+def write(path, numbers, *, setup=lambda _: None, codec="libx264", group=15, **muxer):
+    """A clip of those numbered pictures, each at its own place of 30 a second."""
+    with av.open(str(path), "w", options=muxer) as container:
+        stream = container.add_stream(codec, rate=30, options={"bf": "0", "g": str(group)})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        setup(stream)
+        for number in numbers:
+            frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24").reformat(format="yuv420p")
+            frame.pts, frame.time_base = number - numbers[0], Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
 def put_together(tmp_path, ending, *, settings=({}, {}), setups=(lambda _: None, lambda _: None)):
     """Frames 0 to 59 and 60 to 119, each half with its muxer's settings, in one file."""
     parts = []
     for turn in range(2):
         part = tmp_path / f"{turn}.{ending}"
-        with av.open(str(part), "w", container_options=settings[turn]) as container:
-            stream = container.add_stream("libx264", rate=30, options={"bf": "0", "g": "15"})
-            stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-            setups[turn](stream)
-            for number in range(60 * turn, 60 * turn + 60):
-                frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24")
-                container.mux(stream.encode(frame.reformat(format="yuv420p")))
-            container.mux(stream.encode(None))
+        write(part, range(60 * turn, 60 * turn + 60), setup=setups[turn], **settings[turn])
         parts.append(part.read_bytes())
     both = tmp_path / f"both.{ending}"
     both.write_bytes(b"".join(parts))
@@ -47,6 +53,14 @@ def test_a_film_that_goes_on_under_another_number_is_the_same(tmp_path):
     """A sender that begins anew may number its streams otherwise (mpv#4305): the rest was not shown."""
     clip = put_together(tmp_path, "ts", settings=({}, {"mpegts_start_pid": "512"}))
     assert {*range(59), *range(60, 120)} <= {number_of(one) for one in play(clip)}
+
+
+def test_a_playlist_without_its_end_plays_from_its_beginning(tmp_path):
+    """Of a recording that broke off, whose playlist looks like a live one, the last three parts were played."""
+    playlist = tmp_path / "a.m3u8"
+    write(playlist, range(30), group=3, hls_time="0.1", hls_list_size="0")
+    playlist.write_text(playlist.read_text().replace("#EXT-X-ENDLIST", ""))
+    assert [number_of(one) for one in play(playlist)] == list(range(30))
 
 
 @pytest.mark.parametrize(("ending", "options"), [("ts", {"mpegts_pmt_start_pid": "4200"}), ("flv", {})])
@@ -86,14 +100,7 @@ def test_a_turn_that_a_keyframe_says_holds_up_to_the_next(tmp_path):
 def test_a_frame_that_a_recorder_dropped_keeps_its_place(tmp_path, caplog, codec):
     """AVI has an empty one there: it was called unfinished, and of H.264 the frame before came too late."""
     taken = [one for one in range(30) if one not in {5, 6, 7}]
-    with av.open(str(tmp_path / "a.avi"), "w") as container:
-        stream = container.add_stream(codec, rate=30, options={"bf": "0", "g": "1"})
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-        for number in taken:
-            frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24").reformat(format="yuv420p")
-            frame.pts, frame.time_base = number, Fraction(1, 30)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    write(tmp_path / "a.avi", taken, codec=codec, group=1)
     shown = [number_of(one) for one in play(tmp_path / "a.avi")]
     assert shown == [max(one for one in taken if one <= place) for place in range(30)]
     assert "unfinished" not in caplog.text
