@@ -39,7 +39,8 @@ from hvt_common.protocol.messages import (
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
-from hvt_edge.link.pacer import BaseInFlight, Pacer
+from hvt_edge.link.in_flight import BaseInFlight
+from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.stills import Still
 
 STILL_ATTACHMENT_BYTES = 55
@@ -214,8 +215,7 @@ class Transmitter:
     def most_requested_bytes(self) -> int:
         """About the payload of the largest still that a ground may have at the present rates."""
         with self._lock:
-            line_bytes = self.budget.most_requested_bytes
-        return self._usual_payload(line_bytes)
+            return self._usual_payload(self.budget.most_requested_bytes)
 
     def most_still_bytes(self) -> int:
         """About the payload of the largest still that the budget ever admits."""
