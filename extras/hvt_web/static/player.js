@@ -112,7 +112,8 @@ export class Player {
     if (head.stream !== this.stream) return;
     this.duration = head.duration;
     this.pictures.push({ media: head.media, frame: head.frame, captured: head.captured });
-    if (this.pictures.length > 4000) this.pictures.splice(0, 400);
+    const { buffered } = this.video; // whoever has paused for long plays on from there
+    while (this.pictures.length > 1 && buffered.length && this.pictures[1].media <= buffered.start(0)) this.pictures.shift();
     this.append(data);
   }
 

@@ -1,0 +1,44 @@
+"""The player knows which picture is on the screen, as long as the browser can show it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import hvt_web
+
+PLAYER = Path(hvt_web.__file__).parent / "static" / "player.js"
+NODE = shutil.which("node")
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+def test_who_plays_on_after_a_long_pause_sees_the_time_of_the_picture():
+    """The picture moved below the time and the boxes of the one at which somebody had paused minutes ago."""
+    script = f"""
+      globalThis.window = {{}};
+      const {{ Player }} = await import({json.dumps(PLAYER.as_uri())});
+      let begin = 0;
+      const buffered = {{ length: 1, start: () => begin }};
+      const video = {{ addEventListener() {{}}, buffered, requestVideoFrameCallback() {{}} }};
+      const player = new Player(video, {{}}, null, () => {{}});
+      const none = new Uint8Array(0);
+      const take = (frame) => player.fragment({{ stream: -1, media: frame / 10, frame, captured: frame }}, none);
+      for (let frame = 0; frame < 9000; frame++) take(frame);
+      const found = [player.at(5).frame];
+      begin = 890;
+      take(9000);
+      console.log(JSON.stringify([...found, player.at(890).frame, player.pictures.length]));
+    """
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [50, 8900, 101]
