@@ -44,6 +44,8 @@ _OURS = "hvt.training_commit"
 _ENLARGE_TO = "hvt.enlarge_to"
 _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
+_BROKEN = 0.1
+"""Where no more of an answer is no number, that is some cells; the scores of one class are a fifth."""
 _TWIN_IOU = 0.8
 """Two boxes that overlap more are one object, whatever their classes: networks call one vehicle a car and a van. A
 rider and the bicycle below overlap less."""
@@ -227,12 +229,19 @@ class OnnxDetector:
         return f"{self.preparation}, {how}{', channels last' if self._channels_last else ''}"
 
     def detect(self, image_bgr: Image) -> Detections:
-        """Run the network on one (height, width, 3) uint8 image of any size; grey is accepted too."""
+        """Run the network on one (height, width, 3) uint8 image of any size; grey is accepted too.
+
+        Raises `UserError` where it does not run, or no number comes out: that is no picture without objects.
+        """
         image = as_bgr(image_bgr)
         input_size = self.input_size((image.shape[1], image.shape[0]))
         tensor, letterbox = self._letterboxer.fill(image, input_size)
         least = min(self._confidence, WEAK) if self._averages else self._confidence
-        found = self.head.decode(self._run(tensor), confidence=least, input_size=input_size)
+        outputs = self._run(tensor)
+        found = self.head.decode(outputs, confidence=least, input_size=input_size)
+        used = [outputs[index] for index in self.head.outputs]
+        if not len(found.scores) and any(np.isnan(one).sum() > _BROKEN * one.size for one in used):
+            raise UserError(f"model {self.model.path} answers a picture with what is no number (NaN)")
         if self.head.suppresses:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids

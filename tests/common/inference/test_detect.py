@@ -22,7 +22,14 @@ from hvt_common.inference.runtimes.model import open_model
 from hvt_models.detectors.motion import MotionDetector
 from hvt_models.forms import Dense, Listed
 from media.head_models import family_model
-from media.onnx_models import STRIDES, cells, colour_classifier, colour_detector, constant_model
+from media.onnx_models import (
+    STRIDES,
+    cells,
+    colour_classifier,
+    colour_detector,
+    constant_model,
+    scaling_inside,
+)
 
 RGB = str({0: "red", 1: "green", 2: "blue"})
 
@@ -135,6 +142,15 @@ def test_broken_numbers_never_become_detections(tmp_path: Path) -> None:
     rows = empty(9, 6)
     rows[0, :, 2:] = [5, 5, 0.9, np.nan]
     assert len(Listed(0, 4, 5)([rows], confidence=0.25, input_size=(64, 64)).scores) == 0
+
+
+def test_a_picture_that_gives_no_number_is_none_without_objects(tmp_path: Path) -> None:
+    """Half precision overflows on some pictures: the ground would say that nothing is there."""
+    path = colour_detector(tmp_path / "m.onnx", "ultralytics", size=(96, 64))
+    detector = open_detector(str(scaling_inside(path, [("Mul", -1), ("Add", 0.97), ("Sqrt", None)])))
+    assert len(detector.detect(np.full((64, 96, 3), 240, np.uint8))) == 0
+    with pytest.raises(UserError, match=r"m\.onnx answers a picture with what is no number"):
+        detector.detect(np.full((64, 96, 3), 255, np.uint8))
 
 
 # --- letterbox -----------------------------------------------------------------------------------------------------
