@@ -430,14 +430,13 @@ class Store:
         except sqlite3.Error as error:
             code = error.sqlite_errorcode & 0xFF
             if code == sqlite3.SQLITE_FULL:
-                raise OSError(
-                    errno.ENOSPC,
-                    "no space is left: free some, or name another --store-folder",
-                    str(self.path),
-                ) from None
+                why = "no space is left: free some, or name another --store-folder"
+                raise OSError(errno.ENOSPC, why, str(self.path)) from None
             self._lose()
             why = str(error) if self._file.exists() else _REMOVED
-            if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) or why.startswith(
+                ("no such ", "table ")
+            ):
                 self._file.replace(self._file.with_suffix(".damaged"))
                 self._note_damaged(f"{self._file} is damaged and is put aside as .damaged")
             raise OSError(errno.EIO, why, str(self._file)) from None

@@ -81,22 +81,19 @@ def test_a_damaged_frame_ends_its_segment_and_costs_no_other(tmp_path):
         assert (folder.segments, folder.damaged) == (1, 1), "the second has no whole frame at all"
 
 
-@pytest.mark.parametrize("damage", ["no database", "a page of zeros"])
+@pytest.mark.parametrize("damage", ["no database", "a page of zeros", "tables of another version"])
 def test_a_damaged_file_is_put_aside_and_another_begun(tmp_path, caplog, damage):
     """One bad sector would be the end of storing, at this start and every later one."""
     file = tmp_path / FILE_NAME
     with opened(tmp_path) as folder:
         add_units(folder, UNITS)
     whole = file.read_bytes()
-    file.write_bytes(b"x" * 9000 if damage == "no database" else whole[:4096] + bytes(len(whole) - 4096))
-
-    def use() -> None:
-        with opened(tmp_path) as folder:
-            read_units(folder)
-            add_units(folder, UNITS)
-
-    with pytest.raises(OSError, match=r"malformed|not a database"):
-        use()
+    if damage == "tables of another version":
+        change(tmp_path, "ALTER TABLE part DROP COLUMN crc")
+    else:
+        file.write_bytes(b"x" * 9000 if damage == "no database" else whole[:4096] + bytes(len(whole) - 4096))
+    with pytest.raises(OSError, match=r"malformed|not a database|no such column"), opened(tmp_path) as folder:
+        add_units(folder, [*read_units(folder), *UNITS])
     assert "is damaged and is put aside" in caplog.text
     assert file.with_suffix(".damaged").exists()
     with opened(tmp_path) as folder:
