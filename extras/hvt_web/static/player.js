@@ -207,8 +207,8 @@ export class Player {
         return;
       }
     } catch (error) {
-      if (error instanceof DOMException && error.name === "QuotaExceededError" && video.currentTime > 10) {
-        buffer.remove(0, video.currentTime - 5);
+      if (error instanceof DOMException && error.name === "QuotaExceededError" && (video.currentTime > 10 || !this.live)) {
+        if (video.currentTime > 10) buffer.remove(0, video.currentTime - 5); // else who has paused keeps the picture
       } else if (!(error instanceof DOMException && error.name === "InvalidStateError")) this.onFailed();
       return;
     }

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,24 +15,23 @@ import hvt_web
 PLAYER = Path(hvt_web.__file__).parent / "static" / "player.js"
 NODE = shutil.which("node")
 
+pytestmark = pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
-def test_who_plays_on_after_a_long_pause_sees_the_time_of_the_picture():
-    """The picture moved below the time and the boxes of the one at which somebody had paused minutes ago."""
+
+def ran(script: str) -> Any:
+    """What a script prints that has a ``player``, and ``take`` for a picture of it."""
     script = f"""
       globalThis.window = {{}};
       const {{ Player }} = await import({json.dumps(PLAYER.as_uri())});
       let begin = 0;
+      let failed = false;
       const buffered = {{ length: 1, start: () => begin }};
-      const video = {{ addEventListener() {{}}, buffered, requestVideoFrameCallback() {{}} }};
-      const player = new Player(video, {{}}, null, () => {{}});
+      const does = {{ addEventListener() {{}}, requestVideoFrameCallback() {{}}, pause() {{}} }};
+      const video = {{ ...does, buffered, currentTime: 4 }};
+      const player = new Player(video, {{}}, null, () => {{ failed = true; }});
       const none = new Uint8Array(0);
       const take = (frame) => player.fragment({{ stream: -1, media: frame / 10, frame, captured: frame }}, none);
-      for (let frame = 0; frame < 9000; frame++) take(frame);
-      const found = [player.at(5).frame];
-      begin = 890;
-      take(9000);
-      console.log(JSON.stringify([...found, player.at(890).frame, player.pictures.length]));
+      {script}
     """
     done = subprocess.run(
         [str(NODE), "--input-type=module", "-e", script],
@@ -41,4 +41,28 @@ def test_who_plays_on_after_a_long_pause_sees_the_time_of_the_picture():
         timeout=60,
     )
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == [50, 8900, 101]
+    return json.loads(done.stdout)
+
+
+def test_who_plays_on_after_a_long_pause_sees_the_time_of_the_picture():
+    """The picture moved below the time and the boxes of the one at which somebody had paused minutes ago."""
+    found = ran("""
+      for (let frame = 0; frame < 9000; frame++) take(frame);
+      const found = [player.at(5).frame];
+      begin = 890;
+      take(9000);
+      console.log(JSON.stringify([...found, player.at(890).frame, player.pictures.length]));
+    """)
+    assert found == [50, 8900, 101]
+
+
+def test_a_pause_that_fills_the_browsers_memory_keeps_the_picture():
+    """Who paused in the first ten seconds had single live pictures after some minutes, for good."""
+    said = ran("""
+      const full = () => { throw new DOMException("", "QuotaExceededError"); };
+      player.buffer = { buffered, updating: false, remove() {}, appendBuffer: full };
+      player.pause();
+      take(0);
+      console.log(JSON.stringify([failed, player.live]));
+    """)
+    assert said == [False, False]
