@@ -19,7 +19,7 @@ _TYPES = {1: "<f4", 10: "<f2", 11: "<f8"}
 _MOST_BYTES = 64
 _MOST_STEPS = 12
 _SAME = frozenset({"Cast", "Identity", "Transpose", "Squeeze", "Unsqueeze", "Reshape"})
-_SCALES = frozenset({"Sub", "Add", "Mul", "Div"})
+_ARITHMETIC = frozenset({"Sub", "Add", "Mul", "Div"})
 _BYTE_SLOPE, _BYTE_MEAN = 0.05, 10.0
 """A smaller slope, or a larger mean, is for pixels of 0…255."""
 _IMAGENET_MEANS, _NEAR = (123.7, 116.4, 103.7), 3.0
@@ -66,9 +66,9 @@ def _first_steps(data: mmap.mmap, start: int, end: int) -> tuple[_Numbers | None
     slope, offset, scaled = np.ones(1), np.zeros(1), False
     for _ in range(_MOST_STEPS):
         (node, *others) = users.get(at) or (_Node(),)
-        if others or node.kind not in _SAME | _SCALES:
+        if others or node.kind not in _SAME | _ARITHMETIC:
             break
-        if node.kind in _SCALES:
+        if node.kind in _ARITHMETIC:
             by = constants.get(next((name for name in node.inputs if name != at), ""))
             turned = node.kind in ("Sub", "Div") and node.inputs[0] != at
             if by is None or by.size not in (1, 3) or turned or not (np.isfinite(by) & (by != 0)).all():
