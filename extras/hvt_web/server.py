@@ -169,13 +169,11 @@ class WebPage(Service):
         return self._client
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
         try:
-            self._loop.run_until_complete(self._served())
+            with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+                runner.run(self._served())
         except Exception as error:  # noqa: BLE001 - the flight goes on, and its status says what it lacks
             self._failures.failed(_PART, reason_of(error))
-        finally:
-            self._loop.close()
 
     async def _served(self) -> None:
         # Sessions' posts are taken meanwhile.
