@@ -97,7 +97,7 @@ class Guesses:
         return np.array([one in self._ids for one in ids.tolist()], np.bool_)
 
     def agreed(
-        self, ids: npt.NDArray[np.int64], names: Sequence[str], *, aslant: bool
+        self, ids: npt.NDArray[np.int64], names: Sequence[str], *, aslant: bool | None
     ) -> npt.NDArray[np.bool_]:
         """(N,) True where the detections so far agree on this class; ``aslant`` on none but a car."""
         unknown, otherwise = _Evidence(np.zeros(2)), 2.0 if aslant else _AGREED_ELSE

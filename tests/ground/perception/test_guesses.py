@@ -140,10 +140,10 @@ def test_too_few_tell_nothing():
     tilt = ViewTilt()
     tilt.take(tracks_of(0, [[0, 0, 20, 20], [0, 600, 60, 660]]), NAMES, height_px=720)
     tilt.take(Tracks.none(1), NAMES, height_px=720)
-    assert not tilt.aslant
+    assert tilt.aslant is None
     for _ in range(30):  # side by side
         tilt.take(tracks_of(0, [[0, 300, 20, 320], [80, 300, 140, 360]]), NAMES, height_px=720)
-    assert not tilt.aslant
+    assert tilt.aslant is None
 
 
 @pytest.mark.parametrize("changes", [{"classes": 1}, {"seen": -1}], ids=["people", "carried on"])
@@ -153,4 +153,4 @@ def test_what_is_no_vehicle_or_was_not_just_seen_tells_nothing(changes):
     for seed in range(8):
         boxes = vehicles(6.0, seed=seed).boxes_xyxy_px
         tilt.take(tracks_of(0, boxes, **changes), NAMES, height_px=720)
-    assert not tilt.aslant
+    assert tilt.aslant is None

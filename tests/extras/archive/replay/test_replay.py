@@ -84,14 +84,16 @@ def test_what_came_again_in_flight_comes_again(drawn, tmp_path, capsys):
     log, at = MessageLog(tmp_path / "lossy.hvtlog", most_bytes=10**9), 40
     messages = list(read_log(drawn.folder / "flight.hvtlog"))
     base = [one for one in messages if one.key.endswith(f"/{Channel.BASE}")]
-    before, lost, behind = base[at - 1 : at + 2]
+    lost, behind = base[at : at + 2]
     header = BaseHeader.parse(lost.attachment, lost.payload)
     again = replace(header, flags=header.flags | Flags.RESENT).pack(lost.payload)
+    at_ns = messages[0].received_ns  # 15 frames a second, however busy the machine was
     for one in messages:
+        at_ns += SECOND_NS // 15 * one.key.endswith(f"/{Channel.BASE}")
         if one is not lost:
-            log.log(replace(one, received_ns=before.received_ns + SECOND_NS // 15) if one is behind else one)
+            log.log(replace(one, received_ns=at_ns))
         if one is behind:
-            log.log(replace(lost, attachment=again, received_ns=before.received_ns + SECOND_NS // 10))
+            log.log(replace(lost, attachment=again, received_ns=at_ns + SECOND_NS // 30))
     log.close()
     words = ("--detector", "motion", "--classifier", "none", "--summary", tmp_path / "again.json", *SETTINGS)
     replay(capsys, tmp_path / "lossy.hvtlog", *words)
