@@ -215,6 +215,15 @@ def test_raw_levels_beside_the_rows_are_passed_over(tmp_path: Path) -> None:
     assert opened(constant_model(tmp_path / "m.onnx", rows, *levels)).head.name == "yolov5"
 
 
+@pytest.mark.parametrize("strides", [(8, 16, 32), (4, 8, 16, 32), (16, 32), (4, 8, 16), (8, 16)])
+def test_a_network_may_have_other_levels(tmp_path: Path, strides: tuple[int, ...]) -> None:
+    """One for small objects, without the coarse level, could not be used even with --head."""
+    table = np.full((1, 6, sum(96 * 64 // stride**2 for stride in strides)), 1e-3)
+    table[:, :4] = 32
+    path = constant_model(tmp_path / "m.onnx", table, size=(96, 64), metadata=NAMED)
+    assert opened(path).head.name == "yolov8"
+
+
 def test_classes_without_names_are_numbers_and_said_once(tmp_path: Path, caplog) -> None:
     """Ten classes of somebody's own would be called pedestrian, people and bicycle."""
     for classes in (10, 80):

@@ -130,7 +130,10 @@ def are_whole(numbers: Array) -> bool:
     )
 
 
-STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32))
+STRIDES: tuple[tuple[int, ...], ...] = (
+    *((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32)),
+    *((4, 8, 16), (8, 16)),  # for small objects alone
+)
 YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (
     *STRIDES[:2],
     (8, 16, 32, 12, 24, 48),
