@@ -343,6 +343,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a pose's numbers have no bounds", "value >= kinds[index][0] && value <= kinds[index][1]", "true"),
     Mutant("a roll may be half a turn", "[-1800, 1799, 12, 3, true]", "[-1800, 1800, 12, 3, true]"),
     Mutant("a pose may have a byte behind it", "rest.length < 8", "rest.length < 9"),
+    Mutant("a pose builds on one of long ago", " || sent - this.sent > 12e9", ""),
     Mutant("poses go on over sessions", "values[0] !== this.session", "false"),
     Mutant("a pose may go back in time", "time > this.time && ", ""),
     Mutant("a pose's number does not begin again at 16", "(this.number + 1) % 16", "this.number + 1"),

@@ -500,7 +500,7 @@ const wrapped = (value: number, [from, to]: Numbered): number => {
 };
 
 class PoseReader {
-  private session: Value = null; private number = -1; private time = 0;
+  private session: Value = null; private number = -1; private time = 0; private sent = 0;
   private step = [0, 0];
   private groups: Record<string, number[] | null> | undefined;
 
@@ -510,17 +510,17 @@ class PoseReader {
       const values = read("PoseReport", data, new Uint8Array());
       if (values[0] !== this.session) [this.session, this.groups] = [values[0], undefined];
       if (field("PoseReport", values, "coding") !== 1n) return "skipped";
-      return this.decode(new Bits(field("PoseReport", values, "coded") as Uint8Array));
+      return this.decode(new Bits(field("PoseReport", values, "coded") as Uint8Array), Number(values[1]));
     } catch (error) {
       if (error instanceof Refused) return "damaged";
       throw error;
     }
   }
 
-  private decode(bits: Bits): unknown {
+  private decode(bits: Bits, sent: number): unknown {
     const [alone, number] = [bits.plain(1), bits.plain(4)];
     const before = this.groups;
-    if (!alone && (!before || number !== (this.number + 1) % 16)) return "skipped";
+    if (!alone && (!before || number !== (this.number + 1) % 16 || sent - this.sent > 12e9)) return "skipped";
     const time = alone ? bits.plain(42) : this.time + 1000 + bits.change(4);
     need(alone === 1 || (time > this.time && time < 2 ** 42), "no time behind the last");
     const there = alone ? Array.from({ length: 5 }, () => bits.plain(1)) : [];
@@ -540,7 +540,7 @@ class PoseReader {
       groups[name]?.forEach((value, index) => need(value >= kinds[index][0] && value <= kinds[index][1], "out of bounds"));
     });
     bits.finish();
-    [this.number, this.time, this.step, this.groups] = [number, time, step, groups];
+    [this.number, this.sent, this.time, this.step, this.groups] = [number, sent, time, step, groups];
     const one = (name: string): number | null => (groups[name] ? groups[name]![0] : null);
     return { ...groups, time_ms: time, height: one("height"), altitude: one("altitude"), field: one("field") };
   }

@@ -184,6 +184,11 @@ def poses() -> Iterator[dict[str, Any]]:
     yield {"session": "holes, damage, and one that stands by itself", "reports": list(_read_poses(holes))}
     again = [replace(one, session=8) for one in (reports[1], reports[0], reports[1])]
     yield {"session": "the edge starts again", "reports": list(_read_poses([reports[0], *again]))}
+    late = [
+        replace(reports[0], send_ns=0),
+        *(replace(reports[1], send_ns=ms * 10**6) for ms in (12_001, 12_000)),
+    ]
+    yield {"session": "sixteen are lost", "reports": list(_read_poses(late))}
     for name, scripts in _pose_scripts().items():
         made = [PoseReport(session=9, send_ns=7, coded=one.ended(stop="")) for one in scripts]
         yield {"session": name, "reports": list(_read_poses(made))}

@@ -90,6 +90,16 @@ def test_after_a_loss_nothing_is_shown_before_a_report_stands_by_itself():
     assert poses[-1] is not None
 
 
+@pytest.mark.parametrize("lost", [16, 26, 32])
+def test_after_an_outage_no_report_builds_on_one_of_before_it_that_has_the_number(lost):
+    """The camera would be where it never was, at a time of the outage."""
+    encoder, decoder = PoseEncoder(session_id=SESSION), PoseDecoder()
+    for number, pose in enumerate(flight(100)):
+        report = encoder.encode(pose)(pose.capture_ns)
+        come = None if 35 <= number < 35 + lost else decoder.decode(report)
+        assert come is None or come.capture_ns == pose.capture_ns
+
+
 def test_what_is_not_known_is_not_sent():
     """A ground would draw a camera that points north at the horizon."""
     encoder, decoder = PoseEncoder(session_id=SESSION), PoseDecoder()

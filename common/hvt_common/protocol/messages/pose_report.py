@@ -18,6 +18,8 @@ from hvt_common.values import Orientation, Pose
 _MOST_BYTES: Final = 48
 _MILLION: Final = 1_000_000
 _NUMBERS: Final = 16
+_MOST_PAUSE_NS: Final = 12_000_000_000
+"""No encoder goes on for so long without a report that stands by itself; sixteen reports take longer."""
 _ONE_SECOND_MS: Final = 1000
 _TIME_BITS, _TIME_ORDER = 42, 4
 
@@ -178,6 +180,7 @@ class PoseDecoder:
 
     def __init__(self) -> None:
         self._number = -1
+        self._sent_ns = 0
         self._last: _Sample | None = None
         self._step: tuple[int, ...] = (0, 0)
 
@@ -193,12 +196,16 @@ class PoseDecoder:
         step: tuple[int, ...] = (0, 0)
         if alone:
             sample = _read_whole(bits)
-        elif self._last is None or number != (self._number + 1) % _NUMBERS:
+        elif (
+            self._last is None
+            or number != (self._number + 1) % _NUMBERS
+            or report.send_ns - self._sent_ns > _MOST_PAUSE_NS
+        ):
             return None
         else:
             sample, step = _read_changes(bits, last=self._last, step=self._step)
         bits.finish()
-        self._number, self._last, self._step = number, sample, step
+        self._number, self._sent_ns, self._last, self._step = number, report.send_ns, sample, step
         return sample.pose()
 
 
