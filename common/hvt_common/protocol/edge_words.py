@@ -116,7 +116,7 @@ def lever_sentences(says: str) -> list[str]:
     for decision, why in lever_decisions(says):
         begins = LEVER_WORDS.get(decision, f"{decision[:1].upper()}{decision[1:]}")
         if why == "no answer yet":  # none may have been sent
-            begins = begins.replace("are sent", "may be sent")
+            begins, why = begins.replace("are sent", "may be sent"), "the ground has judged none yet"
         sentences.append(f"{begins}: {why}." if why else f"{begins}.")
     return sentences
 

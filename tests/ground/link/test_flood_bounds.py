@@ -104,7 +104,7 @@ def test_numbers_alone_are_no_event(rig, flight):
         rig.session.take(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
     assert rig.session.reception.levers == said[-1]
     assert [one.text for one in rig.events if isinstance(one, Notice)] == [
-        "The edge sends no tracks: not measured yet. Stills may be sent: no answer yet.",
+        "The edge sends no tracks: not measured yet. Stills may be sent: the ground has judged none yet.",
         (
             "The edge sends its tracks: the video hides 9 objects. "
             "Stills are sent: they name 1 of 2 otherwise."
