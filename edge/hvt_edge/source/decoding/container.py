@@ -44,8 +44,9 @@ QUIET_S, _POLL_S = 10.0, 0.1
 _MOST_BOXES = 64
 DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
 """A sender of MPEG-TS that begins anew may number its film otherwise: it is the same film to a viewer."""
-_FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0"}
-"""A playlist of HLS whose recorder ended before it is read from its beginning, as any file."""
+_FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0", "m3u8_hold_counters": "3"}
+"""A playlist of HLS whose recorder ended before it is read from its beginning, and looked at thrice for more."""
+_PLAYLIST = ".m3u8"
 _WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
 _TS_BYTES = (188, 192, 204)
@@ -98,8 +99,14 @@ def open_video(
             raise UserError(f"source {spec!r} is an empty file; accepted is a video file")
         # By its own name a file may look like an address.
         where: Any = f"file:{spec}" if local else spec
-        file = _GrowingFile(spec) if local and growing else where
-        container = av.open(file, options=_FILE_OPTIONS, timeout=(_OPEN_S, _READ_S))
+        file, options = where, _FILE_OPTIONS
+        if (
+            local and growing and spec.endswith(_PLAYLIST)
+        ):  # FFmpeg looks for more itself, for as long as it may
+            options = {**options, "m3u8_hold_counters": "1000"}
+        elif local and growing:
+            file = _GrowingFile(spec)
+        container = av.open(file, options=options, timeout=(_OPEN_S, _READ_S))
     except (av.error.FFmpegError, OSError, ValueError) as error:
         unfinished = _lacks_index(Path(spec)) if local else ""
         raise refusal(

@@ -11,9 +11,9 @@ from hvt_edge.source.opening import open_source
 from media.numbered import disc, number_of, numbered, patch, write_numbered
 
 
-def play(spec):
+def play(spec, **settings):
     """Its pictures, each as often as it is shown, at 30 frames a second."""
-    with open_source(str(spec), size=lambda size: size, fps=30.0) as source:
+    with open_source(str(spec), size=lambda size: size, fps=30.0, **settings) as source:
         return [frame.source_bgr for frame in source.frames(start_ns=0)]
 
 
@@ -55,12 +55,13 @@ def test_a_film_that_goes_on_under_another_number_is_the_same(tmp_path):
     assert {*range(59), *range(60, 120)} <= {number_of(one) for one in play(clip)}
 
 
-def test_a_playlist_without_its_end_plays_from_its_beginning(tmp_path):
-    """Of a recording that broke off, whose playlist looks like a live one, the last three parts were played."""
+@pytest.mark.parametrize("growing", [False, True])
+def test_a_playlist_without_its_end_plays_from_its_beginning(tmp_path, growing):
+    """Of a recording that broke off, whose list looks live, three parts were played; with --follow none."""
     playlist = tmp_path / "a.m3u8"
     write(playlist, range(30), group=3, hls_time="0.1", hls_list_size="0")
     playlist.write_text(playlist.read_text().replace("#EXT-X-ENDLIST", ""))
-    assert [number_of(one) for one in play(playlist)] == list(range(30))
+    assert [number_of(one) for one in play(playlist, growing=growing)] == list(range(30))
 
 
 @pytest.mark.parametrize(("ending", "options"), [("ts", {"mpegts_pmt_start_pid": "4200"}), ("flv", {})])
