@@ -31,6 +31,7 @@ from hvt_study.datasets.layouts.uri import DATASETS, open_datasets
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.matrix.plan import StudyPlan, parse_regimes
 from hvt_study.matrix.pools import dask_pool, local_pool
+from hvt_study.metrics.bits import ACCOUNTINGS
 from hvt_study.runs.methods import METHODS, Kind, chosen_methods, chosen_names
 from hvt_study.runs.spec import ModelChoice
 
@@ -42,6 +43,11 @@ _ALL_AT_ONCE = 10_000
 
 
 _USUAL: Mapping[str, dict[str, Any]] = {
+    "--accounting": {
+        "choices": ACCOUNTINGS,
+        "help": "rates by the processed span, or by the length of the whole clip as in the pilot's notebooks, for "
+        "comparison with its tables",
+    },
     "--cache": {"type": Path, "metavar": "DIR", "help": "finished flights (default: DIR/cache)"},
     "--classes": {"default": "", "metavar": "NAME,…", "help": "of YOLO labels without classes.txt"},
     "--classifier": {

@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "write there, with one results.parquet of all; needed where there are several (default: DIR itself)"
     )
     option(parser, "--out", required=False, help=there)
+    option(parser, "--accounting")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,6 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
             f"{len(arguments.folders)} studies are given, and no place for the one: add --out DIR"
         )
     where = arguments.folders[0] if out is None else out
-    write_report(where)
+    write_report(where, accounting=getattr(arguments, "accounting", None))
     say(str(where / "report.html"))
     return 0

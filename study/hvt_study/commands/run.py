@@ -15,10 +15,12 @@ from hvt_study.commands.arguments import (
     add_pool_arguments,
     open_pool,
     open_sequences,
+    option,
     study_plan,
 )
 from hvt_study.commands.output import RunProgress, make_out
 from hvt_study.matrix.plan import RunRow, StudyPlan, check_parameters, first_runs, in_order, run_all, staying
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.table_file import RESULTS, read_results, write_results
 from hvt_study.report.example.choice import choose_run, load_example, save_example
 from hvt_study.report.example.fly_again import fly_again
@@ -29,6 +31,7 @@ from hvt_study.runs.execute import run_spec
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to compare, and where it is done and written."""
     add_plan_arguments(parser)
+    option(parser, "--accounting", default="span")
     add_pool_arguments(parser)
 
 
@@ -48,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_parameters(plan, earlier, out=arguments.out)
     rows = _flown(plan, arguments, table, earlier)
     others = staying(rows, earlier)
-    write_results([*rows, *others], table)
+    _write([*rows, *others], arguments, table)
     _add_example(rows, plan, arguments.out)
     write_report(arguments.out)
     failed = [row for row in rows if row["failed"]]
@@ -75,6 +78,10 @@ def _earlier(table: Path) -> list[RunRow]:
         return []
 
 
+def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> None:
+    write_results(in_accounting(rows, arguments.accounting), table)
+
+
 def _flown(
     plan: StudyPlan, arguments: argparse.Namespace, table: Path, earlier: list[RunRow]
 ) -> list[RunRow]:
@@ -97,7 +104,7 @@ def _flown(
         if done:
             with suppress(UserError):  # what ended the study is what is said
                 others = staying(done, earlier)
-                write_results([*in_order(plan, done), *others], table)
+                _write([*in_order(plan, done), *others], arguments, table)
                 beside = f", and {len(others)} of before" if others else ""
                 progress.note(
                     f"{len(done)} finished runs are in {table}{beside}; the same command goes on from there"

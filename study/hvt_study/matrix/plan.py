@@ -24,6 +24,7 @@ from hvt_common.errors import UserError
 from hvt_common.units import parse_bitrate
 from hvt_edge.profiles import REGIMES
 from hvt_study.cache.results import content_key
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.runs.methods import METHODS, Kind, Method
 from hvt_study.runs.spec import ModelChoice, RunSpec, Target, said_run
 from hvt_study.runs.video_shape import SAME_TOTAL, grid_target
@@ -135,7 +136,7 @@ _CONDITIONS = ("dataset", "sequence", "regime", "budget_bps", "labels", "size", 
 
 
 def staying(done: Iterable[RunRow], earlier: Iterable[RunRow]) -> list[dict[str, Any]]:
-    """Which earlier rows belong beside those that were done now, in their order.
+    """Which earlier rows belong beside those that were done now, in their order, rates by the processed span.
 
     Not those of which there is a newer one, whatever its parameters and whatever ran its networks; and no video at
     the total of a run that spends something else by now.
@@ -144,7 +145,9 @@ def staying(done: Iterable[RunRow], earlier: Iterable[RunRow]) -> list[dict[str,
     replaced = {(_place(row), row["method"]) for row in done}
     totals = {_place(row): row["total_bps"] for row in done if not row["matched_to"]}
     return [
-        row for row in earlier if (_place(row), row["method"]) not in replaced and _up_to_date(row, totals)
+        row
+        for row in in_accounting(earlier, "span")
+        if (_place(row), row["method"]) not in replaced and _up_to_date(row, totals)
     ]
 
 

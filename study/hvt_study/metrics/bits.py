@@ -2,17 +2,20 @@
 
 Sizes are line bytes (payload, metadata and transport) as the ledger counts them. They are divided by the processed
 span. The pilot's notebooks divided the bytes of the 300 frames that they processed by the length of the whole clip;
-columns ``…_pilot`` do the same, for comparison with its printed table and for nothing else.
+the accounting ``pilot`` does the same, for comparison with its printed table and for nothing else.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, TypeAlias, get_args
 
 from hvt_common.protocol.channels import Channel
 from hvt_study.datasets.labels import NO_ID
 from hvt_study.metrics.observed import RefinedObject, StillArrival
+
+Accounting: TypeAlias = Literal["span", "pilot"]
 
 
 def line_rates(row_bytes: Mapping[str, int], *, seconds: float) -> dict[str, float]:
@@ -48,3 +51,40 @@ def still_counts(
 def _check(seconds: float) -> None:
     if not seconds > 0:
         raise ValueError(f"rates are divided by {seconds} s, must be above 0")
+
+
+ACCOUNTINGS: tuple[Accounting, ...] = get_args(Accounting)
+_RATES = (
+    "total_bps",
+    "base_bps",
+    "roi_bps",
+    "track_bps",
+    "other_bps",
+    "back_bps",
+    "target_bps",
+    "stills_per_min",
+)
+"""Columns that something is divided by time for. Frames a second are not among them: the pilot's were right."""
+
+
+def in_accounting(rows: Iterable[Mapping[str, Any]], accounting: Accounting) -> list[dict[str, Any]]:
+    """The same rows with their rates in this accounting, whichever they were in.
+
+    All runs of a sequence are divided by the same time: what matched, matches. Rates of failed runs stay null;
+    a rate that cannot be said in this accounting, as the times are not known, becomes null.
+    """
+    return [_restated(row, accounting) for row in rows]
+
+
+def _restated(row: Mapping[str, Any], accounting: Accounting) -> dict[str, Any]:
+    found = {**row, "accounting": accounting}
+    span_s, clip_s = row["duration_s"], row["clip_s"]
+    if row["accounting"] == accounting:
+        return found
+    if not span_s or not clip_s:
+        return found | dict.fromkeys(_RATES)
+    factor = span_s / clip_s if accounting == "pilot" else clip_s / span_s
+    for name in _RATES:
+        if row[name] is not None:
+            found[name] = type(row[name])(round(factor * row[name], 6 if isinstance(row[name], float) else 0))
+    return found

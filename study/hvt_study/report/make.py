@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.arms import RunRow, Setting, counts, sequence_of, settings
-from hvt_study.report.data.captions import ENOUGH, METRICS, written
+from hvt_study.report.data.captions import ENOUGH, METRICS, time_of, written
 from hvt_study.report.data.document import Drawing, Part, Report, Section, Table
 from hvt_study.report.data.pairs import Pair, equal_quality, pairs
 from hvt_study.report.example.choice import Example
@@ -86,6 +87,7 @@ _MATRICES = ("named_f1", "map_50", "hota")
 def make_report(rows: Sequence[RunRow], *, example: Example | None = None) -> Report:
     """All of it, in order; nothing is read or written. `UserError` where two different runs count at one place."""
     found = settings(rows)
+    accounting = next((str(row["accounting"]) for row in rows), "span")
     sections = (
         Section("The answer", tuple(answer(found))),
         Section("End-to-end results", tuple(_each(found, spent_table, seen_table, named_table, size_table))),
@@ -94,8 +96,8 @@ def make_report(rows: Sequence[RunRow], *, example: Example | None = None) -> Re
         Section("Utility over bitrate", tuple(_curves(found, "utility", utility_figure))),
         Section("Still codecs", tuple(_curves(found, "codecs", codec_figure))),
         Section("One flight", tuple(_flight(rows, example))),
-        Section("The pilot's accounting and proxies", tuple(_pilot(found))),
-        Section("Metrics", (metrics_table(),)),
+        Section("The pilot's accounting and proxies", tuple(_pilot(rows, found))),
+        Section("Metrics", (metrics_table(accounting),)),
         Section("Runs that do not count", tuple(_there(failed_table(rows)))),
         Section("What it was run with", tuple(_provenance(rows))),
     )
@@ -112,10 +114,11 @@ def _lead(rows: Sequence[RunRow]) -> Iterator[str]:
     span_s = sum(row["duration_s"] or 0 for row in rows if counts(row))
     bad = len(rows) - good
     strays = _strays(rows)
+    accounting = next((row["accounting"] for row in rows), "span")
     yield (
         f"{_many(len(rows), 'run')} over {_many(sequences, 'sequence')}, {span_s / 60:.1f} minutes of flight. {good} "
         f"count; {bad or 'none'} failed or missed the total to be matched. Rates are of every byte that crosses the "
-        "line, over the processed span, unless a table says otherwise."
+        f"line, over the {time_of(accounting)}, unless a table says otherwise."
     )
     if strays:
         yield (
@@ -150,8 +153,9 @@ def _each(found: Iterable[Setting], *makers: Callable[[Setting], Table]) -> Iter
     yield from (table for table in tables if table.rows)
 
 
-def _pilot(found: Sequence[Setting]) -> Iterator[Part]:
-    yield from _each(found, pilot_table)
+def _pilot(rows: Sequence[RunRow], found: Sequence[Setting]) -> Iterator[Part]:
+    """Both accountings, whichever the other tables are in."""
+    yield from _each(settings(in_accounting(rows, "span")), pilot_table)
     yield from _each(found, proxy_table)
 
 

@@ -14,6 +14,7 @@ from hvt_study.report.data.captions import (
     INTERVALS,
     METRICS,
     NOTHING,
+    definition,
     figure_cell,
     interval_of,
     mean_of,
@@ -79,7 +80,7 @@ class _Kind:
             rows.append((*first, *(_mean_cell(runs, name, interval=self.intervals) for name in shown)))
         heads = (*words("regime", "method", "codec"), Head("n", says="sequences whose run counts"))
         metrics = [METRICS[name] for name in shown]
-        heads += tuple(Head(one.title, says=one.description) for one in metrics)
+        heads += tuple(Head(one.title, says=definition(one, setting.accounting)) for one in metrics)
         caption = f"{self.title}, {setting.name}: {self.says}. {same_sequences(setting)}{under(setting)}"
         return Table(caption, heads, tuple(rows), breaks_between(arm.regime for arm, _ in arms))
 
@@ -151,7 +152,7 @@ def matrix_table(setting: Setting, column: str) -> Table | None:
     heads = words("method", "codec", "what it does")
     heads += tuple(Head(_budget(setting, name)) for name in setting.regimes)
     caption = (
-        f"Method matrix, {metric.title}, {setting.name}: {metric.description}. Each method at "
+        f"Method matrix, {metric.title}, {setting.name}: {definition(metric, setting.accounting)}. Each method at "
         f"the regime's whole budget, mean over sequences; beneath, the {INTERVALS}, and n where it is a mean of "
         "fewer than all. Bold: the highest mean of a regime, among the methods that have the same sequences, and of "
         f"those the most. {under(setting)}"
@@ -196,7 +197,7 @@ def differences_table(setting: Setting, found: Sequence[Pair]) -> Table | None:
         *words("regime", "method", "against"),
         Head("n", says="sequences of which both runs count, of those of which the method's does"),
         Head("kbps", says="mean total of the method and of its match"),
-        *(Head(f"Δ {one.title}", says=one.description) for one in metrics),
+        *(Head(f"Δ {one.title}", says=definition(one, setting.accounting)) for one in metrics),
         Head("ahead", says=f"sequences with more {METRICS[_DECIDES].title}, with less"),
     )
     off = max(pair.most_off_pct() for pair in found)
@@ -275,11 +276,12 @@ def _ahead(pair: Pair) -> str:
     return f"{sum(gap > 0 for gap in gaps)} : {sum(gap < 0 for gap in gaps)}"
 
 
-def metrics_table() -> Table:
-    """What each figure is."""
+def metrics_table(accounting: str) -> Table:
+    """What each figure is, where rates are of this accounting."""
     better = {"more": "higher", "less": "lower", "": NOTHING}
     rows = tuple(
-        cells(one.group, one.title, one.name, one.description, better[one.better]) for one in METRICS.values()
+        cells(one.group, one.title, one.name, definition(one, accounting), better[one.better])
+        for one in METRICS.values()
     )
     titles = ("about", "metric", "column", "definition", "better")
     caption = "Metrics. A figure that a run cannot have is null in the table and a dash here, never 0."
@@ -301,5 +303,7 @@ def failed_table(rows: Iterable[RunRow]) -> Table | None:
         for row in failed
     )
     titles = ("dataset", "sequence", "regime", "method", "at the total of", "why")
-    caption = f"Runs that failed or missed their match ({len(failed)}): they are in no average."
+    other = any(row["accounting"] == "pilot" for row in failed)
+    rates = " Rates in the reasons are over the processed span, not the whole clip." if other else ""
+    caption = f"Runs that failed or missed their match ({len(failed)}): they are in no average.{rates}"
     return Table(caption, words(*titles), said)

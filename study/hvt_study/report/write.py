@@ -17,6 +17,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from markupsafe import Markup
 
 from hvt_common.errors import UserError, check_not_read
+from hvt_study.metrics.bits import Accounting, in_accounting
 from hvt_study.report.data.arms import settings
 from hvt_study.report.data.document import Drawing, Pictures, Report, numbered
 from hvt_study.report.data.table_file import RESULTS, read_results, write_results
@@ -86,13 +87,19 @@ _OURS = re.compile(
 """Files that a report of ours may have written."""
 
 
-def write_report(folder: Path) -> None:
+def write_report(folder: Path, *, accounting: Accounting | None = None) -> None:
     """Read the table again and write ``report.md``, ``report.html`` and ``figures/`` beside it, each file whole.
 
-    Figures of an earlier report that this one does not have are removed. Raises `UserError` where the table cannot be
-    used, or the folder not be written.
+    Figures of an earlier report that this one does not have are removed.
+
+    ``accounting`` is what the pages divide rates by; None: what the table does. Raises `UserError` where the table
+    cannot be used, or the folder not be written.
     """
-    report = make_report(read_results(folder / RESULTS), example=load_example(folder))
+    rows = read_results(folder / RESULTS)
+    report = make_report(
+        rows if accounting is None else in_accounting(rows, accounting),
+        example=load_example(folder),
+    )
     try:
         figures = dict(_figure_files(report))
         (folder / FIGURES).mkdir(exist_ok=True)
@@ -136,13 +143,15 @@ def _remove_others(figures: Path, names: Collection[str]) -> None:
 def join_studies(folders: Sequence[Path], out: Path) -> None:
     """Write one table of all their runs into ``out``; of a run that several have the first counts.
 
-    The flight in pictures is that of the first folder that has one. Raises `UserError` where a table cannot be used,
-    two runs that differ are at one place, or ``out`` cannot be written.
+    Rates are in the accounting of the first table. The flight in pictures is that of the first folder that has one.
+    Raises `UserError` where a table cannot be used, two runs that differ are at one place, or ``out`` cannot be
+    written.
     """
     if len(folders) > 1:  # of one study a table of the same runs is written
         check_not_read(out / RESULTS, (folder / RESULTS for folder in folders), name="--out")
     tables = [read_results(folder / RESULTS) for folder in folders]
-    joined = {row["key"]: row for rows in reversed(tables) for row in rows}
+    accounting: Accounting = next((row["accounting"] for rows in tables for row in rows), "span")
+    joined = {row["key"]: row for rows in reversed(tables) for row in in_accounting(rows, accounting)}
     order = dict.fromkeys(row["key"] for rows in tables for row in rows)
     rows = [joined[key] for key in order]
     settings(rows)  # refuses those that do not go together

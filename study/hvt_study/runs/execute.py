@@ -345,6 +345,7 @@ def _identity(spec: RunSpec) -> RunRow:
     return {
         **{name: getattr(spec, name) for name in own},
         **{name: getattr(spec.models, name) for name in ("detector", "edge_detector", "classifier")},
+        "accounting": "span",
         "matched_to": "" if target is None else target.method,
         "matched_codec": "" if target is None else target.still_codec,
         "target_bps": None if target is None else target.total_bps,

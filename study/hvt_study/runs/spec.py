@@ -141,6 +141,7 @@ class Column:
     over: Literal["", "mean", "median"]
     """What is taken over sequences: waits may be infinite, which a mean does not survive."""
     description: str
+    """``{time}`` stands for what rates are divided by."""
 
 
 def _columns() -> tuple[Column, ...]:

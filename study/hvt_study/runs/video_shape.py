@@ -23,7 +23,7 @@ _STEP = 1.01
 _CLOSE = 0.003
 """Of the target on the grid: with half a step it stays within one per cent of the real one."""
 SAME_TOTAL = 1e-4
-"""Of a total, which tables round."""
+"""Of a total: rates that come back from another accounting are rounded."""
 _TRIES, _MORE = 7, 9
 """Of the secant, and then beside the best budget."""
 _ASIDE = 0.004

@@ -24,6 +24,7 @@ from hvt_study.matrix.plan import (
     run_all,
     staying,
 )
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.runs.methods import METHODS, chosen_methods
 from hvt_study.runs.run_settings import edge_flags
 from hvt_study.runs.spec import ModelChoice
@@ -186,6 +187,7 @@ def row(method, *, total=100_000, to="", target=None, sequence="one", provider="
     }
     spec |= {"still_codec": "", "labels": "annotations", "size": [1280, 720], "max_frames": None}
     spec |= {"detect_every": 5, "models": models, "target": aim, "tune": [], **run}
+    rates = dict.fromkeys(("base_bps", "roi_bps", "track_bps", "other_bps", "back_bps", "stills_per_min"), 0)
     return {
         "key": json.dumps(spec),
         "method": method,
@@ -194,6 +196,10 @@ def row(method, *, total=100_000, to="", target=None, sequence="one", provider="
         "total_bps": total,
         "target_bps": target,
         "config": json.dumps({"run": spec}),
+        "accounting": "span",
+        "duration_s": 20.0,
+        "clip_s": 52.0,
+        **rates,
     }
 
 
@@ -221,6 +227,14 @@ def test_video_at_a_total_that_nobody_spends_any_more_goes():
     assert staying([row("M5", total=104_000)], earlier) == []
     assert staying([row("M5", total=None)], earlier) == []  # it fails by now
     assert staying([row("M5"), row("M0", to="M5", target=100_000)], earlier) == earlier[2:]
+
+
+def test_rates_come_back_from_the_pilots_accounting():
+    """An interrupted study with --accounting pilot would lose the rows that match."""
+    earlier = [row("M0", to="M5", target=123_457)]
+    (stays,) = staying([row("M5", total=123_457)], in_accounting(earlier, "pilot"))
+    assert (stays["accounting"], stays["key"]) == ("span", earlier[0]["key"])
+    assert abs(stays["target_bps"] - 123_457) <= 2
 
 
 def test_other_parameters_need_another_folder():

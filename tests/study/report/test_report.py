@@ -26,6 +26,7 @@ from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.sequence import Clip, Sequence
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.arms import Arm, settings
 from hvt_study.report.data.document import Drawing, Pictures
 from hvt_study.report.data.pairs import equal_quality, needed_bps, pairs
@@ -466,15 +467,42 @@ def test_a_study_of_one_method_or_none_that_counts_has_a_report():
     assert "0 runs" in make_report([]).lead[0]
 
 
+def test_the_pilots_accounting_divides_by_the_clip_and_changes_no_match(tmp_path):
+    """Its printed rates could not be compared with ours, or ours would be taken for them."""
+    rows = [
+        row("a", "M5", 800_000, 0.5, accounting="span", clip_s=25.0, roi_bps=80_000, stills_per_min=60.0),
+        row("a", "M0", 800_000, 0.4, accounting="span", clip_s=25.0, matched_to="M5", target_bps=800_000),
+        row("b", "M5", None, failed="no", matched=False, accounting="span"),
+    ]
+    pilot = in_accounting(rows, "pilot")
+    assert [one["total_bps"] for one in pilot] == [320_000, 320_000, None]
+    assert (pilot[0]["roi_bps"], pilot[0]["stills_per_min"], pilot[1]["target_bps"]) == (
+        32_000,
+        24.0,
+        320_000,
+    )
+    assert {one["accounting"] for one in pilot} == {"pilot"}
+    assert in_accounting(pilot, "span") == rows
+    assert in_accounting(pilot, "pilot") == pilot
+
+    write_results(rows, tmp_path / "results.parquet")
+    assert cli.main(["report", str(tmp_path), "--accounting", "pilot"]) == 0
+    markdown = (tmp_path / "report.md").read_text()
+    assert "rates by the length of the whole clip, as the pilot's" in markdown
+    assert read_results(tmp_path / "results.parquet")[0]["total_bps"] == 800_000, "the table stays"
+
+
 def test_several_studies_are_joined_to_one(tmp_path, capsys):
     """Who shared the sequences among machines would have as many reports as machines, and no interval."""
     one, two = tmp_path / "one", tmp_path / "two"
     for folder in (one, two):
         folder.mkdir()
-    mine = row("a", "M5", 800_000, 0.5, clip_s=20.0)
-    write_results([mine, row("b", "M5", 700_000, 0.6, clip_s=20.0)], one / "results.parquet")
-    theirs = {**row("c", "M5", 600_000, 0.7, clip_s=20.0)}
-    write_results([theirs, {**mine, "named_f1": 0.1}], two / "results.parquet")
+    mine = row("a", "M5", 800_000, 0.5, accounting="span", clip_s=20.0)
+    write_results(
+        [mine, row("b", "M5", 700_000, 0.6, accounting="span", clip_s=20.0)], one / "results.parquet"
+    )
+    theirs = {**row("c", "M5", 600_000, 0.7, accounting="span", clip_s=20.0)}
+    write_results(in_accounting([theirs, {**mine, "named_f1": 0.1}], "pilot"), two / "results.parquet")
     assert cli.main(["report", str(one), str(two)]) == 2
     assert "2 studies are given, and no place for the one: add --out DIR" in capsys.readouterr().err
     assert cli.main(["report", str(one), str(two), "--out", str(tmp_path / "all")]) == 0

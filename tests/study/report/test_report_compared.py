@@ -12,6 +12,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_study import cli
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.arms import Arm, settings
 from hvt_study.report.data.captions import ENOUGH, interval_of, mean_of
 from hvt_study.report.data.pairs import EqualQuality, pairs
@@ -25,6 +26,8 @@ from hvt_study.report.make import make_report
 from hvt_study.report.tables import (
     differences_table,
     equal_table,
+    failed_table,
+    metrics_table,
     named_table,
     proxy_table,
     seen_table,
@@ -152,6 +155,10 @@ def test_a_follower_of_another_total_is_no_match():
             in make_report(ordered).lead[1]
         )
     assert not any("coded to the total" in text for text in make_report([rows[2], rows[4]]).lead)
+    # Rounded on its way through the other accounting, a total is still the same.
+    back = in_accounting(in_accounting([{**one, "clip_s": 33.0} for one in rows], "pilot"), "span")
+    (pair,) = pairs(settings([rows[2] | {"clip_s": 33.0}, *back[3:]])[0])
+    assert list(pair.gaps("named_f1")) == ["demo:0-9#b"]
 
 
 # What is enough
@@ -237,6 +244,39 @@ def test_every_share_of_the_bits_and_every_size_has_a_column():
         column(proxies, head)[0].text for head in ("changed small", "pairs small", "pairs", "positive")[:3]
     ]
     assert shown == ["0.250", "3.0", "9.0"]
+
+
+# The pilot's accounting
+
+
+def test_pages_in_the_pilots_accounting_say_so_everywhere():
+    """Rates by the clip beside the words "processed span" are taken for ours, and are a third of them."""
+    rows = [
+        row("a", "M5", 800_000, 0.5, clip_s=20.0, other_bps=4000),
+        row("a", "M0", 700_000, 0.4, clip_s=20.0),
+        row("b", "M0", None, clip_s=20.0, **to_m5(target_bps=800_000, failed="spends 9 bps", matched=False)),
+    ]
+    pilot = in_accounting(rows, "pilot")
+    assert (pilot[0]["other_bps"], pilot[2]["target_bps"]) == (2000, 400_000)
+    report = make_report(pilot)
+    assert "over the length of the whole clip, unless a table says otherwise" in report.lead[0]
+    says = {cells[2].text: cells[3].text for cells in metrics_table("pilot").rows}
+    assert says["total_bps"] == "line bytes of everything x 8 / length of the whole clip"
+    (setting,) = settings(pilot)
+    figure = utility_figure(setting, name="utility-1")
+    assert ">400<" in figure.svg  # the budget of 800 kbps, where the points are
+    assert ">800<" not in figure.svg
+    assert "by the whole clip" in figure.svg
+    assert "over the processed span" in failed_table(pilot).caption
+    assert "processed span" not in failed_table(rows).caption
+    assert "over the processed span, unless" in make_report(rows).lead[0]
+
+
+def test_a_rate_that_cannot_be_restated_is_not_kept_under_another_name():
+    """A refused run without its times: its target would stand in a table as if it had been divided."""
+    lost = row("a", "M0", None, duration_s=None, **to_m5(target_bps=800_000, failed="no", matched=False))
+    (back,) = in_accounting([lost], "pilot")
+    assert (back["accounting"], back["target_bps"]) == ("pilot", None)
 
 
 # The example, the figures

@@ -25,6 +25,7 @@ def row(sequence, method, total_bps, named_f1=None, **own):
         "edge_detector": "nano",
         "classifier": "detector",
         "matched": True,
+        "accounting": "span",
         "duration_s": 10.0,
         "total_bps": total_bps,
         "named_f1": named_f1,

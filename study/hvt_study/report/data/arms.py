@@ -181,6 +181,10 @@ class Setting:
         budgets = {row["regime"]: row["budget_bps"] or 0 for row in self.rows}
         return tuple(sorted(budgets, key=lambda name: (budgets[name], name)))
 
+    @property
+    def accounting(self) -> str:
+        return str(self.rows[0]["accounting"])
+
     def budget_bps(self, regime: str) -> int:
         return max(row["budget_bps"] or 0 for row in self.rows if row["regime"] == regime)
 

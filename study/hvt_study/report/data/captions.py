@@ -17,6 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from scipy.stats import bootstrap
 
+from hvt_study.metrics.bits import Accounting
 from hvt_study.report.data.arms import Setting, place
 from hvt_study.report.data.document import Cell
 from hvt_study.runs.spec import COLUMNS, Column
@@ -86,6 +87,8 @@ def under(setting: Setting) -> str:
     parts += [f"labels: {_LABELS.get(setting.labels, setting.labels)}", str(setting.models)]
     parts += setting.conditions.unusual()
     parts += [f"{method} with {' '.join(tune)}" for method, tune in setting.tunes.items()]
+    if setting.accounting == "pilot":
+        parts.append("rates by the length of the whole clip, as the pilot's")
     return f"{'; '.join(parts)}."
 
 
@@ -94,6 +97,10 @@ def same_sequences(setting: Setting) -> str:
     if all(len(setting.runs(arm)) == setting.sequences for arm in setting.all_arms):
         return ""
     return "Means of fewer sequences (n) are not to be compared with the others. "
+
+
+def time_of(accounting: Accounting | str) -> str:
+    return "length of the whole clip" if accounting == "pilot" else "processed span"
 
 
 def _datasets(setting: Setting) -> str:
@@ -113,6 +120,11 @@ _DIGITS = {"share": 3, "kbps": 1, "count": 1, "seconds": 2, "ms": 0, "bytes": 0,
 
 METRICS: Mapping[str, Column] = MappingProxyType({one.name: one for one in COLUMNS if one.title})
 """By column, in the order of tables."""
+
+
+def definition(metric: Column, accounting: str) -> str:
+    """In a table whose rates are of this accounting."""
+    return metric.description.replace("{time}", time_of(accounting))
 
 
 def number(value: float, metric: Column, *, sign: bool = False) -> str:

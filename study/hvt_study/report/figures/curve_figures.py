@@ -17,6 +17,7 @@ from hvt_study.report.figures.drawing import drawn, fill_of, plain_axes, rate_ax
 _UTILITY = ("named_f1", "top1_all", "map_50")
 _CODEC = ("named_f1", "confidence_gain", "stills_per_min")
 _LEGEND_COLUMNS = 6
+_TOTAL = {"pilot": "total by the whole clip, kbps"}
 
 
 def utility_figure(setting: Setting, *, name: str) -> Drawing | None:
@@ -33,8 +34,8 @@ def utility_figure(setting: Setting, *, name: str) -> Drawing | None:
             for line in lines:
                 _draw_utility(axes, setting, line, column, shown=shown, codecs=codecs)
             axes.set_ylabel(METRICS[column].title)
-            axes.set_xlabel("total, kbps")
-            rate_axis(axes, [setting.budget_bps(regime) / 1e3 for regime in setting.regimes])
+            axes.set_xlabel(_TOTAL.get(setting.accounting, "total, kbps"))
+            rate_axis(axes, [_budget_kbps(setting, regime) for regime in setting.regimes])
             plain_axes(axes)
         handles, names = panels[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=_LEGEND_COLUMNS, frameon=False)
@@ -179,6 +180,17 @@ def _size_marks(axes: Axes) -> None:
         inside = [value for value in inside if low <= value <= high]
     axes.set_xticks(inside, [f"{mark:g}" for mark in inside])
     axes.minorticks_off()
+
+
+def _budget_kbps(setting: Setting, regime: str) -> float:
+    """In the setting's accounting, as the totals are."""
+    factor = 1.0
+    if setting.accounting == "pilot":
+        rows = [
+            row for row in setting.rows if row["regime"] == regime and row["duration_s"] and row["clip_s"]
+        ]
+        factor = float(np.mean([row["duration_s"] / row["clip_s"] for row in rows])) if rows else 1.0
+    return setting.budget_bps(regime) * factor / 1e3
 
 
 def _codecs(setting: Setting) -> tuple[str, ...]:
