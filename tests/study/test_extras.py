@@ -9,7 +9,7 @@ import sys
 import pytest
 
 STUDY = (
-    *("faster_coco_eval", "jinja2", "matplotlib", "motmetrics", "pandas", "pyarrow", "scipy"),
+    *("faster_coco_eval", "jinja2", "matplotlib", "motmetrics", "optuna", "pandas", "pyarrow", "scipy"),
     *("sklearn", "yaml"),
 )
 GROUND = ("cryptography", "rerun")
@@ -51,10 +51,27 @@ def done(tmp_path, module, words, without):
             marks=pytest.mark.nightly,
         ),
         pytest.param(
+            "hvt_study.cli", ("plan", "demo:0"), ("rerun",), "hvt[study]", marks=pytest.mark.nightly
+        ),
+        pytest.param(
+            "hvt_study.cli",
+            ("tune", "demo:0-1", "--method", "M5", "--out", "out"),
+            ("optuna",),
+            "hvt[study]",
+            marks=pytest.mark.nightly,
+        ),
+        pytest.param(
             "hvt_study.cli", ("report", "out"), ("jinja2",), "hvt[study]", marks=pytest.mark.nightly
         ),
         ("hvt_study.cli", ("read", "demo:codes", "--out", "out"), ("rapidocr",), "hvt[reading]"),
         ("hvt_train", ("curve", "log.jsonl", "--out", "out.svg"), ("matplotlib",), "hvt[study]"),
+        pytest.param(
+            "hvt_study.cli",
+            ("score", "a.csv", "--truth", "gt.txt"),
+            ("sklearn",),
+            "hvt[study]",
+            marks=pytest.mark.nightly,
+        ),
         ("hvt_ground.cli", ("--connect", "tcp/127.0.0.1:9"), ("rerun",), "hvt[ground]"),
         (
             "hvt_ground.cli",
@@ -75,7 +92,16 @@ def done(tmp_path, module, words, without):
 )
 def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, install):
     """Who installed hvt[edge] would get a traceback that names a package of somebody else."""
+    (tmp_path / "a.csv").write_text("frame,x,y,w,h,class\n1,0,0,9,9,car\n")
+    (tmp_path / "gt.txt").write_text("1,1,0,0,9,9,1,1,1\n")
     found = done(tmp_path, module, words, without)
     assert found.returncode == 2, found.stderr
     assert f"pip install {install}".replace("hvt[", "'hvt[").replace("]", "]'") in found.stderr
     assert len([one for one in found.stderr.splitlines() if "opening what they need" not in one]) == 1
+
+
+def test_what_needs_no_extra_works_without_one(tmp_path):
+    """The tracker alone and the selector sweep run where only the edge is installed."""
+    for command in ("track", "sweep"):
+        found = done(tmp_path, "hvt_study.cli", (command, "--help"), (*STUDY, *GROUND))
+        assert found.returncode == 0, found.stderr

@@ -1,11 +1,11 @@
-"""The arguments that commands share, and the study that those of ``run`` ask for."""
+"""The arguments that ``run``, ``plan`` and ``tune`` share, and what they ask for."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -22,8 +22,6 @@ from hvt_common.inference.store import EMBEDDED_DETECTOR, MOTION, parts_of
 from hvt_common.units import parse_size
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.source.contract import check_shape
-from hvt_edge.stills.policy.registry import METHODS as POLICIES
-from hvt_edge.stills.policy.registry import method, tuning
 from hvt_ground.config import DETECTOR, NONE
 from hvt_study.cache.results import check_cache
 from hvt_study.datasets.class_map import joint_classes
@@ -31,6 +29,7 @@ from hvt_study.datasets.layouts.uri import DATASETS, open_datasets
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.matrix.plan import StudyPlan, parse_regimes
 from hvt_study.matrix.pools import dask_pool, local_pool
+from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.metrics.bits import ACCOUNTINGS
 from hvt_study.runs.methods import METHODS, Kind, chosen_methods, chosen_names
 from hvt_study.runs.spec import ModelChoice
@@ -114,8 +113,8 @@ _USUAL: Mapping[str, dict[str, Any]] = {
     "--tune": {
         "action": "append",
         "default": [],
-        "metavar": "METHOD:KEY=VALUE,…",
-        "help": "parameters of a method other than its defaults",
+        "metavar": "METHOD:KEY=VALUE,…|FILE",
+        "help": "parameters of a method other than its defaults, or the tune.json of a search",
     },
 }
 
@@ -130,8 +129,8 @@ def add_pool_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--dask")
 
 
-def add_plan_arguments(parser: argparse.ArgumentParser) -> None:
-    """All that decides which runs there are."""
+def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True, writes: bool = True) -> None:
+    """All that decides which runs there are; ``methods`` where several may be named, ``writes`` with ``--out``."""
     parser.add_argument("datasets", nargs="+", metavar="DATASET", help=", ".join(DATASETS))
     several = (
         "of the ground, and of reference labels: FILE.onnx or a model's name; may be given several times "
@@ -140,22 +139,22 @@ def add_plan_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--detector", action="append", help=several)
     for name in ("--edge-detector", "--classifier", "--refine"):
         option(parser, name)
-    option(parser, "--methods", default=",".join(METHODS))
-    for name in (
-        "--matched-to",
-        "--tune",
-        "--regimes",
-        "--still-codecs",
-        "--labels",
-        "--detect-every",
-        "--size",
-    ):
+    every = ",".join(METHODS)
+    if methods:
+        option(parser, "--methods", default=every)
+        option(parser, "--matched-to")
+        option(parser, "--tune")
+    else:
+        parser.set_defaults(methods=every, tune=[])
+    for name in ("--regimes", "--still-codecs", "--labels", "--detect-every", "--size"):
         option(parser, name)
     option(parser, "--max-frames", help="frames of a sequence")
     for name in ("--limit", "--only", "--provider"):
         option(parser, name)
-    option(parser, "--out", help="results.parquet, report.html, …")
+    written = "results.parquet, report.html, …" if writes else "not needed: nothing is written"
+    option(parser, "--out", required=writes, help=written)
     option(parser, "--cache")
+    parser.set_defaults(writes=writes)
 
 
 def parse_rates(text: str) -> tuple[int, ...]:
@@ -205,16 +204,15 @@ def check_means(arguments: argparse.Namespace) -> None:
     """`UserError` at once for a provider that is not here (with Dask: not known), or a cache that takes no files."""
     if not hasattr(arguments, "dask") or arguments.provider not in PROVIDERS:
         provider_here(arguments.provider)
-    if hasattr(arguments, "cache"):
+    if hasattr(arguments, "cache") and arguments.writes:
         check_cache(arguments.cache)
 
 
 def open_sequences(arguments: argparse.Namespace) -> tuple[tuple[str, Sequence], ...]:
     """(URI, sequence) of all that the arguments name; `UserError` where labels are asked for that nobody made."""
     check_means(arguments)
-    found = tuple(
-        open_datasets(arguments.datasets, limit=getattr(arguments, "limit", None), only=arguments.only)
-    )
+    limit = getattr(arguments, "limit", None)
+    found = tuple(open_datasets(arguments.datasets, limit=limit, only=arguments.only))
     for uri, one in found:
         if one.labels is None and arguments.labels == "annotations":
             raise UserError(f"{uri} {one.name} has no annotations: add --labels reference, or leave it out")
@@ -225,6 +223,7 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
     """What the arguments ask for, with these of `open_sequences`; `UserError` for what cannot be."""
     size = base_size(arguments.size)
     frames = flown_frames(getattr(arguments, "max_frames", None))
+    cache: Path = getattr(arguments, "out", Path()) / "cache"  # who plans writes nothing
     check_whole("--detect-every", arguments.detect_every, 1)
     codecs = tuple(dict.fromkeys(names_of(arguments.still_codecs) or ("",)))
     for codec in codecs:
@@ -236,7 +235,7 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
         still_codecs=codecs,
         models=_models(arguments),
         labels=arguments.labels,
-        cache=Path(getattr(arguments, "cache", arguments.out / "cache")).absolute(),
+        cache=Path(getattr(arguments, "cache", cache)).absolute(),
         size=size,
         max_frames=frames,
         detect_every=arguments.detect_every,
@@ -303,37 +302,6 @@ def _tune(arguments: argparse.Namespace) -> dict[str, tuple[str, ...]]:
         if name not in flown:
             raise UserError(f"--tune of {name} has no say: it is not among --methods {arguments.methods}")
     return found
-
-
-def tuned_methods(words: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """By method, what `RunSpec.tune` is: each word is ``METHOD:KEY=VALUE,…``. Later words win.
-
-    Raises:
-        UserError: a word is not so, the method sends no stills or has no such parameter, or its value is none.
-    """
-    found: dict[str, dict[str, float]] = {}
-    for word in words:
-        name, colon, said = word.partition(":")
-        if not colon:
-            raise UserError(
-                f"--tune {word!r} is not accepted: give METHOD:KEY=VALUE, such as M5:small_weight=0.5"
-            )
-        parameters = tuning((said,))
-        known = {row.casefold(): row for row, one in METHODS.items() if one.sends_stills}
-        own = known.get(name.strip().casefold())
-        if own is None:
-            raise UserError(f"--tune {word!r} is of {name!r}: choose one of {', '.join(known.values())}")
-        method(own, **parameters)
-        found[own] = found.get(own, {}) | parameters
-    texts = {  # equal parameters are equal texts, and a method with its defaults is that method
-        name: tuple(
-            f"{key}={value:g}"
-            for key, value in sorted(one.items())
-            if value != POLICIES[name].parameters[key]
-        )
-        for name, one in found.items()
-    }
-    return {name: text for name, text in texts.items() if text}
 
 
 def _check_classes(plan: StudyPlan, sequences: Many[tuple[str, Sequence]]) -> None:

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="DIR",
-        help="with results.parquet",
+        help="with results.parquet; sweep.csv of hvt-study sweep is taken in where it is there",
     )
     there = (
         "write there, with one results.parquet of all; needed where there are several (default: DIR itself)"

@@ -1,6 +1,6 @@
 """Annotations and detections as lines of numbers between commas. What is wrong is said with the file and the line.
 
-A line that is wrong costs a dataset itself and no more.
+A line that is wrong costs a dataset itself and no more; of results that are to be judged it ends the reading.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ class Rows:
     lines: npt.NDArray[np.int64]
     """(N,) line in the file, from 1."""
     text: tuple[str, ...]
+    of_dataset: bool = False
+    """A line that is wrong is left out."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -48,9 +50,9 @@ class Rows:
         return np.asarray(self.table[:, self.columns.index(column)])
 
     def only(self, good: npt.NDArray[np.bool_], *, accepted: str) -> Rows:
-        """The rows that are good. What is left out is counted, and its first row named in the log.
+        """The rows that are good. What is left out of a dataset is counted, and its first row named in the log.
 
-        `UserError` names it where none is good.
+        `UserError` names it where none is good, or these rows are of no dataset.
         """
         if good.all():
             return self
@@ -58,7 +60,7 @@ class Rows:
         line = self.text[row]
         shown = line if len(line) <= _SHOWN_CHARS else line[:_SHOWN_CHARS] + "…"
         said = f"{self.path}, line {self.lines[row]} is {shown!r}; accepted is {accepted}"
-        if not good.any():
+        if not (self.of_dataset and good.any()):
             raise UserError(said)
         _log.warning("%d of %d lines are left out; the first: %s", (~good).sum(), len(good), said)
         good_rows = np.flatnonzero(good)
@@ -71,11 +73,12 @@ class Rows:
         return np.stack([x, y, x + self["w"], y + self["h"]], axis=1).astype(np.float32)
 
 
-def read_rows(path: Path, *, columns: str, least: int, frames: bool = True) -> Rows:
+def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_dataset: bool = False) -> Rows:
     """Read a file of which the columns between commas are called so; further ones and blank lines are no matter.
 
     Every line must have the ``least`` first ones and as many as the first line, of which ``frames`` are counted by
-    the first column. A line that is not so is left out as long as there are others; else `UserError` names it.
+    the first column. A line that is not so is left out ``of_dataset``, as long as there are others; else `UserError`
+    names it.
     """
     numbered = [
         (number, line.strip())
@@ -95,8 +98,8 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True) -> R
             whole = (table[:, 0] % 1 == 0) & (table[:, 0] >= 0) & (table[:, 0] <= LAST_FRAME)
         good = np.logical_and(good, whole)
     numbers = np.array([number for number, _ in numbered], np.int64)
-    rows = Rows(path, table, names[:count], numbers, lines).only(good, accepted=wanted)
-    if names[:2] != ("frame", "id"):
+    rows = Rows(path, table, names[:count], numbers, lines, of_dataset).only(good, accepted=wanted)
+    if not of_dataset or names[:2] != ("frame", "id"):
         return rows
     once = np.zeros(len(rows), np.bool_)
     once[np.unique(rows.table[:, :2], axis=0, return_index=True)[1]] = True

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.files import MOST_TABLE_BYTES, read_text
 from hvt_study.datasets.labels import FrameLabels
+from hvt_study.datasets.layouts.mot import read_truth_rows
 from hvt_study.metrics.classes import ClassScore, class_score
 from hvt_study.metrics.judged import FrameView, judged
 
+_log = logging.getLogger(__name__)
 _MOST_HELD, _LEAST_GAPS = 15, 10
 """Frames; and so many distances have to be known before any counts as usual."""
 SMALL_SHARE = 0.0012
@@ -57,6 +60,25 @@ def _lines(table: csv.DictReader[str]) -> Iterator[tuple[int, list[float], str]]
             raise ValueError(f"line {table.line_num} has no box")
         frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
         yield frame, [x, y, x + w, y + h], line["class"]
+
+
+def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, FrameLabels]:
+    """Read MOTChallenge ground truth (``frame,id,x,y,w,h,1,class,visibility``) by frame; hidden ones stand beside.
+
+    Raises `UserError` where a line is wrong, or no object counts.
+    """
+    rows = read_truth_rows(path, class_names)
+    if not rows.judged.any():
+        raise UserError(f"{path} has no object that counts: there is nothing to score against")
+    if rows.classless:
+        _log.warning("%s has ten columns, which name no class: all are %s", path, rows.class_names[0])
+    found: dict[int, FrameLabels] = {}
+    for frame in np.unique(rows.frames).tolist():
+        here = rows.frames == frame
+        counts = np.flatnonzero(here & rows.judged)
+        names = [rows.class_names[row] for row in counts.tolist()]
+        found[frame] = FrameLabels.plain(rows.boxes[counts], names, beside=rows.boxes[here & ~rows.judged])
+    return found
 
 
 def score(

@@ -84,12 +84,15 @@ def _pairs(count: int, one: str, several: str) -> str:
 _MATRICES = ("named_f1", "map_50", "hota")
 
 
-def make_report(rows: Sequence[RunRow], *, example: Example | None = None) -> Report:
+def make_report(
+    rows: Sequence[RunRow], *, sweep: Table | None = None, example: Example | None = None
+) -> Report:
     """All of it, in order; nothing is read or written. `UserError` where two different runs count at one place."""
     found = settings(rows)
     accounting = next((str(row["accounting"]) for row in rows), "span")
     sections = (
         Section("The answer", tuple(answer(found))),
+        Section("Selector sweep", (sweep,) if sweep is not None else ()),
         Section("End-to-end results", tuple(_each(found, spent_table, seen_table, named_table, size_table))),
         Section("Method matrix", tuple(_matrices(found))),
         Section("Against video at the same bits", tuple(_against(found))),

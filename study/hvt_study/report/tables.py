@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import pandas as pd
 
+from hvt_common.errors import UserError
 from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, counts, place, values
 from hvt_study.report.data.captions import (
     ENOUGH,
@@ -307,3 +309,35 @@ def failed_table(rows: Iterable[RunRow]) -> Table | None:
     rates = " Rates in the reasons are over the processed span, not the whole clip." if other else ""
     caption = f"Runs that failed or missed their match ({len(failed)}): they are in no average.{rates}"
     return Table(caption, words(*titles), said)
+
+
+_TYPES = {"policy": str, "selected": int, "ratio": float, "frame_coverage": float}
+
+
+def sweep_table(path: Path) -> Table | None:
+    """The selector sweep that ``hvt-study sweep --out`` left here; None where there is none.
+
+    Raises `UserError` where the file is not what that command writes.
+    """
+    if not path.exists():
+        return None
+    try:
+        found = pd.read_csv(path, dtype=_TYPES, usecols=list(_TYPES))
+        if found.empty or found.isna().any(axis=None):
+            raise ValueError("no rows, or cells without a value")  # noqa: TRY301
+    except (OSError, ValueError):
+        raise UserError(
+            f"{path} is not a table of {','.join(_TYPES)}: write it with hvt-study sweep --out {path.parent}"
+        ) from None
+    heads = (
+        Head("selector", number=False),
+        Head("selected"),
+        Head("ratio", says="of the raw detections"),
+        Head("frame coverage", says="share of frames with raw detections that keep at least one ROI"),
+    )
+    rows = tuple(
+        cells(row.policy, row.selected, f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}")
+        for row in found.itertuples()
+    )
+    caption = "Selector sweep: what each of the pilot's selectors keeps of raw detections in all. No labels."
+    return Table(caption, heads, rows)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import re
+import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from html import escape
@@ -20,9 +21,10 @@ from hvt_common.errors import UserError, check_not_read
 from hvt_study.metrics.bits import Accounting, in_accounting
 from hvt_study.report.data.arms import settings
 from hvt_study.report.data.document import Drawing, Pictures, Report, numbered
-from hvt_study.report.data.table_file import RESULTS, read_results, write_results
+from hvt_study.report.data.table_file import RESULTS, SWEEP, read_results, write_results
 from hvt_study.report.example.choice import load_example, save_example
 from hvt_study.report.make import make_report
+from hvt_study.report.tables import sweep_table
 
 FIGURES = "figures"
 _ID = re.compile(r'\bid="([^"]+)"')
@@ -98,6 +100,7 @@ def write_report(folder: Path, *, accounting: Accounting | None = None) -> None:
     rows = read_results(folder / RESULTS)
     report = make_report(
         rows if accounting is None else in_accounting(rows, accounting),
+        sweep=sweep_table(folder / SWEEP),
         example=load_example(folder),
     )
     try:
@@ -143,9 +146,9 @@ def _remove_others(figures: Path, names: Collection[str]) -> None:
 def join_studies(folders: Sequence[Path], out: Path) -> None:
     """Write one table of all their runs into ``out``; of a run that several have the first counts.
 
-    Rates are in the accounting of the first table. The flight in pictures is that of the first folder that has one.
-    Raises `UserError` where a table cannot be used, two runs that differ are at one place, or ``out`` cannot be
-    written.
+    Rates are in the accounting of the first table. The flight in pictures and the selector sweep are those of the
+    first folder that has one. Raises `UserError` where a table cannot be used, two runs that differ are at one place,
+    or ``out`` cannot be written.
     """
     if len(folders) > 1:  # of one study a table of the same runs is written
         check_not_read(out / RESULTS, (folder / RESULTS for folder in folders), name="--out")
@@ -157,6 +160,9 @@ def join_studies(folders: Sequence[Path], out: Path) -> None:
     settings(rows)  # refuses those that do not go together
     try:
         out.mkdir(parents=True, exist_ok=True)
+        sweep = next((folder / SWEEP for folder in folders if (folder / SWEEP).exists()), None)
+        if sweep is not None and not (out / SWEEP).exists():
+            shutil.copyfile(sweep, out / SWEEP)
     except OSError as error:
         raise UserError(f"--out {out} cannot be written ({error.strerror}): name a folder that can") from None
     write_results(rows, out / RESULTS)

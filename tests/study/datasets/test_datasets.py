@@ -13,7 +13,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_scene import Scene
 from hvt_study.datasets.annotation_rows import read_rows
-from hvt_study.datasets.layouts.mot import mot_table
+from hvt_study.datasets.layouts.mot import mot_table, read_truth_rows
 from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.datasets.sequence import content_hash, stage_clip
 from media.clips import smooth_pictures
@@ -287,6 +287,8 @@ def test_labels_that_count_frames_or_pixels_otherwise_than_images_are_refused(tm
     truth.write_text("".join(f"{int(frame) - 1},{rest}\n" for frame, rest in rows))
     with pytest.raises(UserError, match="images from 1, and its annotations count frames from 0"):
         open_dataset(f"mot:{tmp_path}")
+    with pytest.raises(UserError, match="accepted is a frame number from 1 on"):
+        read_truth_rows(truth, ["x"] * 13)
     truth.write_text("".join(f"{frame},{rest}\n" for frame, rest in rows))
     for image in sorted((tmp_path / "MOT17-02" / "img1").iterdir()):
         image.rename(image.with_stem(f"{int(image.stem) - 1:06d}"))

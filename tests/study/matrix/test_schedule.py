@@ -6,29 +6,16 @@ import json
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_edge.stills.policy.registry import METHODS as POLICIES
-from hvt_study.commands.arguments import tuned_methods
-from hvt_study.matrix.plan import (
-    Regime,
-    StudyPlan,
-    check_parameters,
-    first_runs,
-    matched_runs,
-    parse_regimes,
-    run_all,
-    staying,
-)
+from hvt_study.matrix.plan import Regime, StudyPlan, check_parameters, parse_regimes, run_all, staying
 from hvt_study.metrics.bits import in_accounting
 from hvt_study.runs.methods import METHODS, chosen_methods
-from hvt_study.runs.run_settings import edge_flags
 from hvt_study.runs.spec import ModelChoice
-from hvt_study.runs.video_shape import VideoShape, grid_target
+from hvt_study.runs.video_shape import grid_target
 
 SPENT = {"M2": 700_000, "M5": 780_000, "M6": 783_000}
 
@@ -121,48 +108,6 @@ def test_words_for_regimes():
         chosen_methods("M0,M9")
     assert [row.name for row in chosen_methods("M5,m0")] == ["M0", "M5"]
     assert all(row.says for row in METHODS.values())
-
-
-def test_video_is_coded_again_for_those_that_are_named():
-    """A matrix in which one method is compared with video would take five times as long."""
-    plan = replace(plan_of("M0,M5,auto", codecs=("jpeg",), regimes="low"), matched_to=("auto",))
-    matched = {
-        one.method: list(matched_runs(plan, one, {"failed": "", "total_bps": 250_000}))
-        for one in first_runs(plan)
-    }
-    assert {name: len(runs) for name, runs in matched.items()} == {"M0": 0, "M5": 0, "auto": 1}
-
-
-def test_parameters_are_those_of_the_runs():
-    """Weights of one's own would never stand against video of the same bits."""
-    words = ["M5:small_weight=0.7,min_cost=0.5", "m6:again=2", "M5:small_weight=0.75"]
-    plan = replace(plan_of("M0,M5,M6", codecs=("jpeg",), regimes="low"), tune=tuned_methods(words))
-    tunes = {spec.method: spec.tune for spec in first_runs(plan)}
-    assert tunes == {"M0": (), "M5": ("min_cost=0.5", "small_weight=0.75"), "M6": ("again=2",)}
-    tuned = next(spec for spec in first_runs(plan) if spec.method == "M5")
-    flags = edge_flags(tuned, budget_bps=300_000, shape=VideoShape())
-    assert [flags[at + 1] for at, flag in enumerate(flags) if flag == "--tune"] == list(tuned.tune)
-    (video,) = matched_runs(plan, tuned, {"failed": "", "total_bps": 250_000})
-    assert (video.method, video.target.total_bps, video.tune) == ("M0", 250_000, ())
-    usual = POLICIES["M5"].parameters
-    assert tuned_methods([f"M5:{name}={value!r}" for name, value in usual.items()]) == {}, "M5 as it is"
-
-
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("small_weight=0.7", "METHOD:KEY=VALUE"),
-        ("M0:small_weight=0.7", "choose one of M1"),
-        ("M5:speed=1", "no parameter 'speed'"),
-        ("M5:small_weight", "write KEY=VALUE"),
-        ("M5:small_weight=-1", "write a number from 0"),
-    ],
-)
-def test_wrong_parameters_are_one_sentence(word, said):
-    """A slip of the pen would be flown for days."""
-    with pytest.raises(UserError, match=said) as caught:
-        tuned_methods([word])
-    assert "\n" not in str(caught.value)
 
 
 # Which rows of a table stay when a study is started again in the same folder.

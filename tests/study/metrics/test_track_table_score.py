@@ -10,9 +10,11 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_ground.events import Notice, Overlay
 from hvt_ground.sinks.event_tables import TrackTable
+from hvt_scene import Scene
+from hvt_study.cli import main
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.metrics.judged import FrameView
-from hvt_study.metrics.track_table_score import read_tracks, score
+from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
 
 AREA_PX = 1280 * 720
 
@@ -37,6 +39,21 @@ def test_known_answer() -> None:
     assert result.counts.top1_all == pytest.approx(1 / 3)
     # car: 1 hit of 2 objects and 2 claims; van: no hit.
     assert result.macro_f1_all == pytest.approx((2 * 1 / (2 + 2) + 0) / 2)
+
+
+def test_who_lists_a_hidden_object_is_neither_right_nor_wrong(tmp_path: Path) -> None:
+    """A ground that sees more than was judged would be scored worse for it."""
+    lines = ["1,1,0,0,10,10,1,1,1.0", "1,2,50,0,20,20,1,1,0.2"]
+    (tmp_path / "gt.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    truth = read_truth(tmp_path / "gt.txt", class_names=("car",))
+    seen = (0.0, 0.0, 10.0, 10.0, "car")
+    results = [
+        score({1: shown(seen, *more)}, truth, frame_area_px=AREA_PX)
+        for more in ((), ((50.0, 0.0, 70.0, 20.0, "car"),), ((200.0, 0.0, 220.0, 20.0, "car"),))
+    ]
+    assert [one.counts.labels for one in results] == [1, 1, 1]
+    assert [one.false_per_frame for one in results] == [0, 0, 1]
+    assert results[0].named_f1 == results[1].named_f1 == 1
 
 
 def test_a_track_counts_for_one_object_only() -> None:
@@ -70,7 +87,7 @@ def overlay(
 
 
 def test_the_table_of_the_ground_reads_back(tmp_path: Path) -> None:
-    """What hvt-ground --tracks writes is what the demo's table is made of."""
+    """What hvt-ground --tracks writes is what hvt-study score reads."""
     path = tmp_path / "tracks.csv"
     table = TrackTable(path)
     table.log(overlay(0, [(1, 2, 11, 22), (5, 5, 9, 9)], ("car", "van")))
@@ -84,7 +101,29 @@ def test_the_table_of_the_ground_reads_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(read[1].boxes_xyxy_px[0], (1, 2, 11, 22))
 
 
-def test_wrong_files_are_one_sentence(tmp_path: Path) -> None:
+def test_perfect_tracks_of_the_demo_score_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The whole way, from the scene's truth file to the printed table."""
+    truth_path, tracks_path = tmp_path / "gt.txt", tmp_path / "perfect.csv"
+    lines = [
+        "1,1,10,10,50,30,1,1,1.000",
+        "1,2,100,10,50,30,1,2,1.000",
+        "2,1,12,10,50,30,1,1,0.900",
+        "2,2,9,9,9,9,1,3,0.1",
+    ]
+    truth_path.write_text("\n".join(lines) + "\n")
+    names = Scene.class_names
+    table = TrackTable(tracks_path)
+    table.log(overlay(0, [(10, 10, 60, 40), (100, 10, 150, 40)], (names[0], names[1])))
+    table.log(overlay(1, [(12, 10, 62, 40)], (names[0],)))
+    table.close()
+    assert main(["score", f"ours={tracks_path}", "--truth", str(truth_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "ours" in printed
+    assert printed.count("1.000") >= 4
+    assert "│ objects on all frames               │     3 │" in printed
+
+
+def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A table of something else is named, not counted as no tracks."""
     junk = tmp_path / "junk.csv"
     for text in (
@@ -96,8 +135,10 @@ def test_wrong_files_are_one_sentence(tmp_path: Path) -> None:
         junk.write_text(text)
         with pytest.raises(UserError, match=r"junk\.csv is not a table of tracks"):
             read_tracks(junk)
-    with pytest.raises(UserError, match=r"none\.csv cannot be read \(No such file or directory\)"):
-        read_tracks(tmp_path / "none.csv")
+    with pytest.raises(UserError, match=r"junk\.csv, line 1 is 'a,b'"):
+        read_truth(junk, class_names=("car",))
+    assert main(["score", str(junk), "--truth", str(junk)]) == 2
+    assert "Traceback" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -116,3 +157,58 @@ def test_between_two_coded_frames_the_list_stands(tmp_path, frames, shown):
     tracks = read_tracks(table)
     assert set(tracks) == shown
     assert all(tracks[one].boxes_xyxy_px[0, 0] == max(f for f in frames if f <= one) for one in shown)
+
+
+def scored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], truth: bytes, *more: str
+) -> tuple[int, str, str]:
+    """Exit code, table and errors of a score of one perfect track against this truth."""
+    (tmp_path / "gt.txt").write_bytes(truth)
+    (tmp_path / "t.csv").write_bytes(b"\xef\xbb\xbfframe,x,y,w,h,class\n1,10,10,50,30,pedestrian\n")
+    code = main(["score", str(tmp_path / "t.csv"), "--truth", str(tmp_path / "gt.txt"), *more])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_truth_without_classes_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog) -> None:
+    """Ten columns with -1, as MOT15 and trackers write, gave 0 objects and a named F1 of 1."""
+    code, table, _ = scored(tmp_path, capsys, b"1,1,10,10,50,30,1,-1,-1,-1\n1,2,200,10,50,30,1,-1,-1,-1\n")
+    assert code == 0
+    assert "│ objects on all frames               │     2 │" in table
+    assert "│ found (recall at IoU 0.5)           │ 0.500 │" in table
+    assert "name no class: all are pedestrian" in caplog.text
+    code, table, _ = scored(tmp_path, capsys, b"1,1,10,10,50,30,1,-1,-1,-1\n", "--classes", "person")
+    assert "│ class right, of those found (top-1) │ 0.000 │" in table
+
+
+@pytest.mark.parametrize("truth", [b"", b"1,1,10,10,50,30,0,1,1\n", b"1,1,10,10,50,30,1,1,0.1\n"])
+def test_nothing_has_no_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str], truth: bytes) -> None:
+    """A perfect score would be reported of an empty file."""
+    code, table, said = scored(tmp_path, capsys, truth)
+    assert (code, table) == (2, "")
+    assert "gt.txt has no object that counts" in said
+
+
+def test_a_line_of_truth_that_is_wrong_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A class that nobody named would be counted as another."""
+    code, _, said = scored(tmp_path, capsys, b"1,1,10,10,50,30,1,1,1\n1,1,10,10,50,30,1,0,1\n")
+    assert code == 2
+    assert "gt.txt, line 2 is" in said
+    assert "a class from 1 to" in said
+
+
+def test_truth_with_any_byte_order_mark_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file that went through an editor of Windows would be called no text."""
+    text = "1,1,10,10,50,30,1,1,1\r\n"
+    for encoding in ("utf-8-sig", "utf-16"):
+        assert scored(tmp_path, capsys, text.encode(encoding))[0] == 0
+
+
+def test_a_table_that_is_missing_and_a_class_without_a_name_are_said(tmp_path, capsys):
+    """Every object would be of no class, and a missing file of another format."""
+    tracks, truth = tmp_path / "t.csv", tmp_path / "gt.txt"
+    truth.write_text("1,1,0,0,9,9,1,1,1\n")
+    assert main(["score", str(tracks), "--truth", str(truth)]) == 2
+    assert f"{tracks} cannot be read (No such file or directory)" in capsys.readouterr().err
+    assert main(["score", str(tracks), "--truth", str(truth), "--classes", "car,,van"]) == 2
+    assert "--classes 'car,,van' has an empty name" in capsys.readouterr().err

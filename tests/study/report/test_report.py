@@ -393,6 +393,7 @@ def written(tmp_path_factory):
     rows[0]["versions"] = json.dumps({"hvt": "0.1.0"})
     write_results(rows, folder / "results.parquet")
     save_example(folder, example("b-M5-600000"))
+    (folder / "sweep.csv").write_text("policy,selected,ratio,frame_coverage\npermissive,30,0.81,0.99\n")
     assert main(["report", str(folder)]) == 0
     return folder
 
@@ -424,16 +425,17 @@ def test_names_within_drawings_are_not_shared(written):
 
 
 def test_the_page_has_all_that_the_paper_has(written):
-    """End-to-end results, method matrix, metrics; and figures as files of their own."""
+    """Selector sweep, end-to-end results, method matrix, metrics; and figures as files of their own."""
     for text in ((written / "report.html").read_text(), (written / "report.md").read_text()):
         for heading in (
-            *("The answer", "End-to-end results", "Method matrix", "Metrics", "One flight"),
+            *("The answer", "Selector sweep", "End-to-end results", "Method matrix", "Metrics", "One flight"),
             *("Against video at the same bits", "Utility over bitrate", "Still codecs"),
             *("Runs that do not count", "What it was run with"),
         ):
             assert heading in text
         assert "+0.200 named F1" in text  # the answer
         assert "That is no verdict" in text
+        assert "permissive" in text
         assert "hvt 0.1.0" in text
     markdown = (written / "report.md").read_text()
     shown = re.findall(r"\]\((figures/[^)]+)\)", markdown)

@@ -33,6 +33,7 @@ from hvt_study.report.tables import (
     seen_table,
     size_table,
     spent_table,
+    sweep_table,
 )
 from hvt_study.report.write import inline_svg, write_report
 from hvt_study.runs.methods import METHODS
@@ -279,7 +280,7 @@ def test_a_rate_that_cannot_be_restated_is_not_kept_under_another_name():
     assert (back["accounting"], back["target_bps"]) == ("pilot", None)
 
 
-# The example, the figures
+# The example, the sweep, the figures
 
 
 def test_the_flight_that_is_shown_sent_stills():
@@ -322,6 +323,25 @@ def test_only_numbers_have_a_minus_and_captions_name_what_is_there():
     assert "its only still" in shown.caption
     _, several = crops(gain_db=-1.5, stills=2)
     assert "of its 2 stills those at the 50th percentile" in several.caption
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "foo,bar\n",
+        "policy,selected,ratio,frame_coverage\n",
+        "foo,bar\n1,2\n",
+        "policy,selected\nall,many\n",
+    ],
+)
+def test_a_sweep_without_its_columns_or_rows_gets_one_sentence(tmp_path, text):
+    """An empty table in a report says that no selector keeps anything."""
+    path = tmp_path / "sweep.csv"
+    assert sweep_table(path) is None
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"sweep\.csv is not a table of policy,selected"):
+        sweep_table(path)
 
 
 def test_no_mark_of_a_method_can_be_taken_for_an_arrow_or_another_method():

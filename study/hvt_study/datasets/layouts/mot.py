@@ -22,7 +22,8 @@ from __future__ import annotations
 import configparser
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Sequence as Names
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -32,6 +33,7 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.files import read_text
 from hvt_common.inference.labels import read_labels
+from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
@@ -42,6 +44,7 @@ _INFO = "seqinfo.ini"
 _TRUTH = "gt/gt.txt"
 _PICTURES = "img1"
 _COLUMNS = "frame,id,x,y,w,h,counts,class,visibility"
+_LEAST_VISIBLE = 0.5
 _LAYOUT = "NAME/seqinfo.ini, NAME/img1/000001.jpg and NAME/gt/gt.txt"
 _NAMES = ("pedestrian", "person on vehicle", "car", "bicycle", "motor", "non-motorised vehicle")
 """MOT17's classes from 1 on that may be objects."""
@@ -76,7 +79,7 @@ def mot_table(
     truth: Path, names: Path, size: tuple[int, int], beside: tuple[int, ...] = _BESIDE
 ) -> LabelTable:
     """All labels of a sequence; ``names`` may be missing, and ``beside`` are then classes that are not asked for."""
-    rows = read_rows(truth, columns=_COLUMNS, least=7)
+    rows = read_rows(truth, columns=_COLUMNS, least=7, of_dataset=True)
     own = names.is_file()
     class_names = read_labels(names) if own else _NAMES
     rows, kinds = _kinds(rows, len(class_names) if own else _HIGHEST, own=own)
@@ -90,6 +93,40 @@ def mot_table(
         kinds = np.searchsorted(used, kinds) + 1
     ignored = Regions.of(rows, passed, np.zeros(len(rows), np.bool_), origin=1.0)
     return LabelTable.of(rows, judged, kinds - 1, class_names, ignored=ignored, size=size, origin=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class TruthRows:
+    """Rows of a gt.txt whose classes are given apart, in its order."""
+
+    frames: npt.NDArray[np.int64]
+    boxes: Boxes
+    """(N, 4) x1 y1 x2 y2 pixels that count from 0."""
+    class_names: tuple[str, ...]
+    judged: npt.NDArray[np.bool_]
+    """(N,) False for what does not count, and for what is hidden by half."""
+    classless: bool
+    """MOT15's ten columns, which name no class: all are of the only name that was given, else pedestrians."""
+
+
+def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
+    """Of a file whose classes from 1 on have these names; `UserError` names the line that is wrong."""
+    rows = read_rows(truth, columns=_COLUMNS, least=7)
+    rows = rows.only(rows["frame"] >= 1, accepted="a frame number from 1 on")
+    classless = _in_the_world(rows)
+    if classless:
+        known = names[0] if len(names) == 1 else _NAMES[0]
+        words = (known,) * len(rows)
+    else:
+        rows = rows.only(
+            np.isin(rows["class"], np.arange(1, len(names) + 1)), accepted=_class_text(len(names))
+        )
+        words = tuple(names[int(kind) - 1] for kind in rows["class"].tolist())
+    judged = rows["counts"] != 0
+    if not classless:
+        share = rows["visibility"]
+        judged &= (share >= _LEAST_VISIBLE) | (share < 0)  # -1 where the file does not say
+    return TruthRows(rows["frame"].astype(np.int64), rows.boxes(), words, judged, classless)
 
 
 def _class_text(highest: int) -> str:

@@ -113,7 +113,9 @@ def open_uavdt(root: Path, options: Options) -> Mapping[str, Callable[[], Sequen
 
 def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
     """All labels of a sequence; ``whole`` may be a ``_gt.txt``, and ``ignore`` may be missing."""
-    rows = read_rows(whole, columns="frame,id,x,y,w,h,out-of-view,occlusion,category", least=9)
+    rows = read_rows(
+        whole, columns="frame,id,x,y,w,h,out-of-view,occlusion,category", least=9, of_dataset=True
+    )
     plain = not whole.name.endswith("_gt_whole.txt")
     if not plain:
         rows = rows.only(
@@ -152,7 +154,7 @@ def _open_uavdt(name: str, folder: Path, texts: Mapping[str, Path], options: Opt
 def _regions(path: Path) -> Regions:
     if not path.is_file():  # some copies of the dataset come without
         return Regions(no_ids(), no_boxes(), np.empty(0, np.bool_))
-    rows = read_rows(path, columns="frame,region,x,y,w,h", least=6)
+    rows = read_rows(path, columns="frame,region,x,y,w,h", least=6, of_dataset=True)
     every = np.ones(len(rows), np.bool_)
     return Regions.of(rows, every, every)
 

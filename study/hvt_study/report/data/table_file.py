@@ -15,6 +15,7 @@ from hvt_common.errors import UserError
 from hvt_study.runs.spec import COLUMNS, Column
 
 RESULTS = "results.parquet"
+SWEEP = "sweep.csv"
 _TYPES = {"text": pa.string(), "int": pa.int64(), "real": pa.float64(), "yes": pa.bool_()}
 _NAMED = 4
 _NEEDED = ("budget_bps", "duration_s", "clip_s", "total_bps", "target_bps")

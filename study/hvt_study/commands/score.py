@@ -1,0 +1,64 @@
+"""``hvt-study score``: tables of tracks against ground truth, side by side."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.units import parse_size
+from hvt_scene import Scene
+from hvt_study.commands.arguments import option
+from hvt_study.commands.output import print_columns
+from hvt_study.metrics.classes import ClassScore
+from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
+
+_ROWS: tuple[tuple[str, Callable[[ClassScore], float]], ...] = (
+    ("found (recall at IoU 0.5)", lambda one: one.recall),
+    ("class right, of those found (top-1)", lambda one: one.counts.top1_found),
+    ("the same of small objects", lambda one: one.by_size["small"].top1_found),
+    ("macro-F1", lambda one: one.macro_f1_all),
+    ("found with the right class", lambda one: one.counts.top1_all),
+    ("named F1", lambda one: one.named_f1),
+    ("false objects a frame", lambda one: one.false_per_frame),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "tracks", nargs="+", metavar="[NAME=]TRACKS.csv", help="tables of tracks; NAME heads the column"
+    )
+    truth = "MOTChallenge ground truth: frame,id,x,y,w,h,1,class,visibility"
+    option(parser, "--truth", type=Path, required=True, metavar="GT.txt", help=truth)
+    option(parser, "--classes", default=",".join(Scene.class_names), help="names of the truth's classes")
+    option(parser, "--size")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    width, height = parse_size(arguments.size, name="--size")
+    names = [name.strip() for name in arguments.classes.split(",")]
+    if not all(names):
+        raise UserError(
+            f"--classes {arguments.classes!r} has an empty name: give names between commas, from class 1 on"
+        )
+    truth = read_truth(arguments.truth, class_names=names)
+    columns: list[tuple[str, ClassScore]] = []
+    for spec in arguments.tracks:
+        name, separator, path = spec.rpartition("=")
+        file = Path(path)
+        label = name if separator else file.stem
+        tracks = read_tracks(file)
+        columns.append((label, score(tracks, truth, frame_area_px=width * height)))
+    _print(columns)
+    return 0
+
+
+def _print(columns: Sequence[tuple[str, ClassScore]]) -> None:
+    rows = [("objects on all frames", *(f"{one.counts.labels}" for _, one in columns))]
+    for label, figure in _ROWS:
+        figures = [figure(one) for _, one in columns]
+        rows.append((label, *("-" if math.isnan(one) else f"{one:.3f}" for one in figures)))
+    heads = ("", *(name for name, _ in columns))
+    print_columns("What the ground knows, on every frame", heads, rows, words=("",))

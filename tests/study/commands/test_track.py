@@ -1,0 +1,183 @@
+"""``hvt-study track`` and the MOTChallenge files it reads and writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hvt_study.cli import main
+from hvt_study.commands.track import detections_by_frame, read_detections
+
+LINE = "{frame},-1,{x},20,40,60,{score},-1,-1,-1\n"
+
+
+def write(path: Path, lines: list[str]) -> Path:
+    """Write a small file and name it."""
+    path.write_text("".join(lines))
+    return path
+
+
+def moving(frames: list[int], *, score: float = 0.9) -> list[str]:
+    """Lines of one object at 2 px a frame."""
+    return [LINE.format(frame=k, x=100 + 2 * k, score=score) for k in frames]
+
+
+def sentence(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line on stderr of a call that must end with exit code 2."""
+    assert main([str(each) for each in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("hvt-study: ")
+    return lines[0]
+
+
+@pytest.mark.realdata
+def test_upstream_is_reproduced_from_file_to_file(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever checks the tracker against the authors' program would find another result."""
+    results = json.loads((data / "tracking/palace/detections.json").read_text())["results"]
+    source = write(
+        tmp_path / "det.txt",
+        [
+            f"{int(r['frame_id']) + 1},-1,{r['x']},{r['y']},{r['width']},{r['height']},{r['prob']}\n"
+            for r in results
+        ],
+    )
+    out = tmp_path / "tracks.txt"
+    options = [
+        *("--fps=30", "--track-thresh=0.5", "--track-buffer=30", "--match-thresh=0.8", "--min-box-area=10")
+    ]
+    assert main(["track", str(source), "--out", str(out), *options]) == 0
+    assert capsys.readouterr().out == f"{out}: 314 frames, 45 tracks, 5961 boxes\n"
+    ours, theirs = (
+        np.loadtxt(path, delimiter=",") for path in (out, data / "tracking/palace/bytetrack_tracks.txt")
+    )
+    theirs[:, 0] += 1
+    theirs = theirs[np.lexsort((theirs[:, 1], theirs[:, 0]))]
+    np.testing.assert_array_equal(ours[:, [0, 1, 7, 8, 9]], theirs[:, [0, 1, 7, 8, 9]])
+    np.testing.assert_allclose(ours[:, 2:7], theirs[:, 2:7], atol=1e-3)
+
+
+def test_frames_without_detections_are_stepped(tmp_path: Path) -> None:
+    """A track hidden for longer than the buffer would come back with its old id, or a short gap would end it."""
+    out = tmp_path / "out.txt"
+    for gap, ids in ((20, [1]), (60, [1, 2])):
+        source = write(tmp_path / f"{gap}.txt", moving([*range(1, 10), *range(10 + gap, 20 + gap)]))
+        assert main(["track", str(source), "--out", str(out)]) == 0
+        rows = read_detections(out)
+        assert sorted(set(rows["id"].tolist())) == ids
+        assert rows["frame"].max() == 19 + gap
+
+
+def test_options_reach_the_tracker(tmp_path: Path) -> None:
+    """Comparisons with other parameters would compare nothing."""
+    source = write(tmp_path / "det.txt", moving(list(range(1, 8)), score=0.45))
+    out = tmp_path / "out.txt"
+
+    def boxes(*options: str) -> int:
+        assert main(["track", str(source), "--out", str(out), *options]) == 0
+        return len(read_detections(out))
+
+    assert boxes() == 0
+    assert boxes("--track-thresh", "0.3") == 7
+    assert boxes("--track-thresh", "0.3", "--new-thresh", "0.5") == 0
+    assert boxes("--track-thresh", "0.3", "--min-box-area", "2400.5") == 0
+    # IoU * 0.45 is never above 0.6; without the score the IoU alone is.
+    assert boxes("--track-thresh", "0.3", "--match-thresh", "0.4") < 7
+    assert boxes("--track-thresh", "0.3", "--match-thresh", "0.4", "--no-fuse-scores") == 7
+
+
+def test_unordered_lines_blank_lines_and_further_columns_are_read(tmp_path: Path) -> None:
+    """Files of other detectors would be refused, or their frames mixed up."""
+    path = tmp_path / "det.txt"
+    path.write_bytes(
+        b"\xef\xbb\xbf3,-1,1,2,10,20,0.5,-1,-1,-1\r\n\r\n1, -1, 5,6,7,8, 0.25\r\n3,-1,1,2,10,20,0.75,x\r\n"
+    )
+    frames = dict(detections_by_frame(read_detections(path)))
+    assert sorted(frames) == [1, 2, 3]
+    assert len(frames[2]) == 0
+    np.testing.assert_allclose(frames[1].boxes_xyxy_px, [[5, 6, 12, 14]])
+    assert frames[3].confidences.tolist() == [0.5, 0.75]
+
+
+def test_an_empty_file_gives_an_empty_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A sequence without any object would stop a batch of experiments."""
+    source, out = write(tmp_path / "det.txt", ["\n"]), tmp_path / "out.txt"
+    assert main(["track", str(source), "--out", str(out)]) == 0
+    assert out.read_text() == ""
+    assert "0 frames, 0 tracks, 0 boxes" in capsys.readouterr().out
+
+
+def test_detections_without_area_are_left_out_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One box turned inside out would spoil all tracks, or vanish without a word."""
+    lines = [*moving([1, 2, 3]), "2,-1,5,5,-4,9,0.9\n", "3,-1,5,5,0,9,0.9\n"]
+    assert main(["track", str(write(tmp_path / "d.txt", lines)), "--out", str(tmp_path / "o.txt")]) == 0
+    assert "3 frames, 1 tracks, 3 boxes; 2 detections without area left out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "2,-1,1,2,3",
+        "2,-1,nan,2,3,4,0.9",
+        "2,-1,1,2,inf,4,0.9",
+        "2,-1,1e300,2,3,4,0.9",
+        "1.5,-1,1,2,3,4,0.9",
+        "-2,-1,1,2,3,4,0.9",
+        "99999999999,-1,1,2,3,4,0.9",
+        "frame,id,x,y,w,h,score",
+        "2 -1 1 2 3 4 0.9",
+    ],
+)
+def test_a_malformed_line_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str) -> None:
+    """The user would search a file of a million lines for the bad one."""
+    source = write(tmp_path / "det.txt", [*moving([1]), line + "\n"])
+    said = sentence(capsys, "track", source, "--out", tmp_path / "out.txt")
+    assert f"{source}, line 2 is {line!r}" in said
+    assert not (tmp_path / "out.txt").exists()
+
+
+def test_wrong_files_and_arguments_are_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The user would be shown a traceback in place of what to change."""
+    source, out = write(tmp_path / "det.txt", moving([1, 2])), tmp_path / "out.txt"
+    binary = tmp_path / "model.onnx"
+    binary.write_bytes(b"\x08\x07\xff\xfe\x80")
+    assert "none.txt cannot be read" in sentence(capsys, "track", tmp_path / "none.txt", "--out", out)
+    assert "not UTF-8 text" in sentence(capsys, "track", binary, "--out", out)
+    assert "cannot be read" in sentence(capsys, "track", tmp_path, "--out", out)
+    assert "cannot be written" in sentence(capsys, "track", source, "--out", tmp_path / "no" / "out.txt")
+    assert f"--out {source} is {source} itself" in sentence(capsys, "track", source, "--out", source)
+    for fps in ("0", "-5", "nan", "inf", "fast"):
+        assert f"--fps: is {fps}," in sentence(capsys, "track", source, "--out", out, f"--fps={fps}")
+    assert "--track-thresh: is 2," in sentence(capsys, "track", source, "--out", out, "--track-thresh=2")
+    assert "--low-thresh is 0.9" in sentence(capsys, "track", source, "--out", out, "--low-thresh=0.9")
+    assert "--track-buffer: is -1," in sentence(capsys, "track", source, "--out", out, "--track-buffer=-1")
+    assert "--out" in sentence(capsys, "track", source)
+    assert "invalid choice: 'fly'" in sentence(capsys, "fly")
+    assert "COMMAND" in sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("2,-1,10,10,20,20,87.5\n", "line 2 is '2,-1,10,10,20,20,87.5'; accepted is a score from 0 to 1"),
+        ("2,-1,10,10,20,20,-0.5\n", "accepted is a score from 0 to 1 in column 7"),
+        ("2,7,10,10,20,20,0.5\n", "line 2 is '2,7,10,10,20,20,0.5'; accepted is -1 in column 2"),
+    ],
+)
+def test_what_is_no_detection_is_refused_with_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, words: str
+) -> None:
+    """Scores of 0 to 100 would all be certain, and a file of tracks be tracked again."""
+    source = write(tmp_path / "det.txt", ["1,-1,10,10,20,20,0.9\n", line])
+    assert words in sentence(capsys, "track", source, "--out", tmp_path / "out.txt")

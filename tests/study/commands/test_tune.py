@@ -1,0 +1,81 @@
+"""``hvt-study tune``: a real search, small, and what it says of sequences that it has not seen."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_study.cache.results import ResultCache
+from hvt_study.cli import main
+from hvt_study.commands.tune import split, tunable
+from hvt_study.matrix.tuning import tuned_methods
+from studies.small_study import arguments, write_scene
+
+NAMES = ("north", "east", "west")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scene"), *NAMES)
+
+
+@pytest.mark.nightly
+def test_a_search_is_judged_on_what_it_has_not_seen(scene, tmp_path, capsys):
+    """Weights that fit the sequences they were found on would be sold as better ones."""
+    chosen = list(tunable("M5"))[:2]
+    words = ("--method", "M5", "--parameters", ",".join(chosen), "--trials", "2", "--held-out", "0.34")
+    asked = ["tune", *arguments(scene, tmp_path / "out", *words, "--regimes", "300kbps", "--jobs", "2")]
+    assert main(asked) == 0
+    told = capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / "tune.json").read_text())
+    train, held_out = split([(scene, name) for name in NAMES], held_out=0.34)
+    assert [(one["dataset"], one["sequence"]) for one in found["held_out"]] == held_out
+    assert len(train) == 2
+    (row,) = found["held_out"]
+    assert 0 < row["default"] <= 1
+    assert 100_000 < row["default_bps"] <= 300_000
+    assert 100_000 < row["tuned_bps"] <= 300_000
+    assert found["held_out_gain"] == pytest.approx(row["tuned"] - row["default"])
+    assert found["train_tuned"] >= found["train_default"] > 0
+    assert found["trials"] == 2
+    assert list(found["parameters"]) == chosen
+    if found["train_tuned"] == found["train_default"]:
+        assert found["parameters"] == {name: tunable("M5")[name] for name in chosen}
+    assert held_out[0][1] in told
+    changed = found["train_tuned"] > found["train_default"]
+    assert bool(tuned_methods([str(tmp_path / "out" / "tune.json")])) == changed, "run takes it as it is"
+    assert not any(name in told for _, name in train)
+    flown = list((tmp_path / "out" / "cache" / "flights").rglob("*.json"))
+    cache = ResultCache(tmp_path / "out" / "cache" / "flights")
+    tunes = [tuple(cache.get(path.stem)["settings"]["edge"]["tune"]) for path in flown]
+    assert tunes.count(()) == 3  # as it is, on all three
+    assert len(set(tunes) - {()}) == 2  # two proposals
+    assert len(tunes) == 3 + 2 * 2 + (found["train_tuned"] > found["train_default"])
+
+
+def test_what_cannot_be_tuned_is_told(scene, tmp_path, capsys):
+    """Hours of flights that all are the same."""
+    for words, wanted in (
+        (("--method", "M0"), "--method M0 has nothing to tune"),
+        (("--method", "M5", "--parameters", "speed"), "--parameters 'speed' is not one of M5"),
+        (("--method", "M5", "--trials", "0"), "--trials 0"),
+        (("--method", "M5", "--seed", "-1"), "--seed -1 is not accepted"),
+        (("--method", "M5", "--still-codecs", "jpeg,residual"), "--still-codecs jpeg,residual are several"),
+        (("--method", "M5", "--only", "north"), "1 sequences"),
+    ):
+        assert main(["tune", *arguments(scene, tmp_path / "out", *words)]) == 2
+        assert wanted in capsys.readouterr().err
+    with pytest.raises(UserError, match="M5, M6"):
+        tunable("permissive")
+
+
+def test_a_sequence_stays_on_its_side():
+    """A sequence that was searched on today would be held out tomorrow, when the set has grown."""
+    names = [("set", f"s{number}") for number in range(40)]
+    train, held_out = split(names, held_out=0.25)
+    assert (len(train), len(held_out)) == (30, 10)
+    assert not set(train) & set(held_out)
+    assert split(names, held_out=0.25) == (train, held_out)
+    assert set(split(list(reversed(names)), held_out=0.25)[1]) == set(held_out)
