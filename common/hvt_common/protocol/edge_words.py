@@ -115,9 +115,10 @@ def lever_sentences(says: str) -> list[str]:
     sentences = []
     for decision, why in lever_decisions(says):
         begins = LEVER_WORDS.get(decision, f"{decision[:1].upper()}{decision[1:]}")
+        sentence = f"{begins}: {why}." if why else f"{begins}."
         if why == "no answer yet":  # none may have been sent
-            begins, why = begins.replace("are sent", "may be sent"), "the ground has judged none yet"
-        sentences.append(f"{begins}: {why}." if why else f"{begins}.")
+            sentence = f"{begins.replace('are sent', 'may be sent')}: the ground has judged none yet."
+        sentences.append(sentence)
     return sentences
 
 
