@@ -334,30 +334,6 @@ def mended_early() -> bool:
     return False
 
 
-def dark_and_light(listener: socket.socket, *, unit_s: float) -> tuple[list[float], list[float]]:
-    """Darkness of half a unit after the first; return when something came in it, and when after it, in units."""
-    light, dark = (LinkState(2_000_000, dark=dark) for dark in (False, True))
-    line = script((0, light), (unit_s, dark), (1.5 * unit_s, light), lasts_s=3 * unit_s, queue_bytes=8_000)
-    with Relay(line, target_port=listener.getsockname()[1]) as relay:
-        began_s = time.monotonic()
-        relay.begin()
-        got = exchange(relay, listener, seconds=2.5 * unit_s)
-    came = [(at_s - began_s) / unit_s for at_s, _ in got]
-    return [at for at in came if 1.05 < at < 1.5], [at for at in came if at > 1.5]
-
-
-def test_a_tcp_connection_is_dark_in_darkness(listener):
-    """As above, on real sockets."""
-    # A thread that is stopped reads late what came in time, and then a longer darkness tells; a leak is in each.
-    tries = []
-    for unit_s in (0.4, 2.0, 8.0):
-        in_darkness, after_it = dark_and_light(listener, unit_s=unit_s)
-        tries.append((in_darkness, after_it))
-        if after_it and not in_darkness:
-            return
-    pytest.fail(f"it came in the dark, or not in the light after it: {tries}")
-
-
 def test_who_gave_up_in_darkness_was_never_there():
     """The ground would be busy with the corpses of the edge's tries, and late for the living one."""
     for dark_s in (0.7, 3.0, 15.0):

@@ -15,7 +15,7 @@ from hvt_edge.video.encoder import (
     minimum_bps,
 )
 from hvt_edge.video.x265 import BaseEncoder
-from media.clips import framed, hard_pictures, real_pictures
+from media.clips import framed, hard_pictures
 
 SIZE, FPS = (640, 360), 15
 KEYFRAMES = (20, 46, 95, 125)
@@ -54,15 +54,6 @@ def test_the_base_stays_within_its_share(base_bps, count):
     bits = line_bits(hard_pictures(count, size=SIZE), asked(base_bps, round(base_bps / 0.8125)))
     assert 0.88 * base_bps <= sum(bits) / (count / FPS) <= 1.02 * base_bps
     assert fullest_second(bits) <= 1.15 * base_bps
-
-
-@pytest.mark.realdata
-def test_the_base_stays_within_its_share_on_a_real_clip(data):
-    """As above, on what the product is for."""
-    pictures = real_pictures(data / "clips" / "drone_carpark.mp4", 75, size=SIZE)
-    bits = line_bits(pictures, asked(200_000, 246_000))
-    assert 0.85 * 200_000 <= sum(bits) / (len(bits) / FPS) <= 1.02 * 200_000
-    assert fullest_second(bits) <= 1.15 * 200_000
 
 
 def test_video_alone_stays_within_the_total():

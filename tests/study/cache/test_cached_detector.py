@@ -5,9 +5,7 @@ from __future__ import annotations
 import shutil
 
 import numpy as np
-import pytest
 
-from hvt_common.errors import UserError
 from hvt_common.inference.store import resolve_model
 from hvt_study.cache.cached_detector import CachedDetector
 
@@ -53,26 +51,3 @@ def test_a_model_goes_by_its_content(tmp_path):
     other.write_bytes(model.read_bytes() + b"\x72\x07\x0a\x01a\x12\x02bc")  # one entry of metadata more
     opened(memory, other).detect(PICTURE)
     assert len(entries(memory)) == 3
-
-
-@pytest.mark.parametrize(
-    "damage", [lambda data: data[:-3], lambda data: data[:20] + b"\x80\x04." + data[23:], lambda _: b""]
-)
-def test_a_damaged_answer_is_asked_for_again(tmp_path, damage, caplog):
-    """A file that a full disk cut off would end the study with a traceback, or worse, count."""
-    first = opened(tmp_path).detect(PICTURE)
-    (path,) = entries(tmp_path)
-    whole = path.read_bytes()
-    path.write_bytes(damage(whole))
-    assert same(opened(tmp_path).detect(PICTURE), first)
-    assert "is damaged" in caplog.text
-    assert entries(tmp_path) == [path]
-    assert same(opened(tmp_path).detect(PICTURE), first)
-    assert caplog.text.count("is damaged") == 1
-
-
-def test_a_folder_that_cannot_be_is_told_in_a_sentence(tmp_path):
-    """A traceback in place of the path that is wrong."""
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot be made"):
-        opened(tmp_path / "file" / "memory")

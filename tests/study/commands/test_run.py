@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
-from argparse import ArgumentParser
 
 import numpy as np
 import pytest
 
-from hvt_study.cache.results import read_whole
 from hvt_study.cli import main
 from hvt_study.commands import run as command
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
 from hvt_study.runs import execute
 from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_context import open_materials, open_run_context
-from hvt_study.runs.run_settings import flown
 from hvt_study.runs.spec import COLUMNS, ModelChoice
-from hvt_study.runs.video_shape import VideoShape, within
+from hvt_study.runs.video_shape import within
 from media.onnx_models import colour_classifier, colour_detector
-from programs.processes import PATIENT_S
 from studies.layouts import write_visdrone
 from studies.small_study import (
     REGIME,
@@ -29,8 +25,6 @@ from studies.small_study import (
     detector,
     entries,
     flights,
-    said,
-    study,
     table,
 )
 
@@ -116,25 +110,6 @@ def test_video_spends_what_the_others_really_spent(done):
         assert row["total_bps_pilot"] == row["total_bps"]
 
 
-def test_totals_are_of_the_bytes_that_were_sent(scene, done, tmp_path):
-    """A total that forgot headers, tracks or status would give the hybrid bits for nothing."""
-    from hvt_study.commands.arguments import add_plan_arguments, open_sequences, study_plan
-
-    parser = ArgumentParser()
-    add_plan_arguments(parser)
-    asked = parser.parse_args(arguments(scene, tmp_path, *METHODS, "--max-frames", "30"))
-    plan = study_plan(asked, open_sequences(asked))
-    spec = next(one for one in first_runs(plan) if one.method == "M5")
-    report = flown(
-        spec, open_run_context(spec, cache=done / "cache"), budget_bps=spec.budget_bps, shape=VideoShape()
-    )
-    row = next(row for row in table(done) if row["method"] == "M5")
-    assert row["digest"] == report.digest
-    assert row["total_bps"] == round(sum(report.line_bytes.values()) * 8 / 2)
-    assert row["roi_bps"] == round(report.line_bytes["roi"] * 8 / 2) > 0
-    assert row["total_bps"] == report.account.total_bps
-
-
 def test_a_run_that_cannot_be_flown_is_in_no_average(done):
     """One budget too many would end the study, or count as a bad result."""
     rows = [row for row in table(done) if row["regime"] == "9kbps"]
@@ -157,28 +132,6 @@ def test_a_second_run_does_nothing_anew(scene, done):
     assert main([*again, "--jobs", "1"]) == 0
     assert entries(cache) == before
     assert (done / "results.parquet").read_bytes() == clocks  # to the byte: what was timed is remembered too
-
-
-@pytest.mark.nightly
-def test_damaged_entries_are_made_again(scene, done, tmp_path):
-    """What a full disk or a bad sector left of an entry would count as a result."""
-    cache, first = done / "cache", table(done)
-    before = entries(cache)
-    broken = [flights(cache)[0], flights(cache)[1], next((cache / "detections").iterdir())]
-    broken[0].write_bytes(broken[0].read_bytes()[:-20])
-    broken[1].write_bytes(b"")
-    broken[2].write_bytes(b"\0" * 40)
-    again = arguments(scene, done, "--methods", "M0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
-    process = study("run", *again, folder=tmp_path)
-    assert process.wait(PATIENT_S) == 0, said(tmp_path)
-    words = said(tmp_path)
-    assert f"{broken[0]} is damaged and is made again" in words
-    assert f"{broken[1]} is damaged and is made again" in words
-    assert table(done) == first
-    after = entries(cache)
-    assert after.keys() == before.keys()
-    assert {path for path in after if after[path] != before[path]} <= set(broken)
-    assert all(map(read_whole, broken[:2]))
 
 
 def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkeypatch):

@@ -13,7 +13,6 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, MOVING, VISDRONE_NAMES
 from hvt_common.values import Posterior
-from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.datasets.class_map import map_classes
 from hvt_study.datasets.labels import covered_share
 from hvt_study.datasets.layouts.uri import open_dataset
@@ -263,21 +262,3 @@ def test_a_classifier_names_the_boxes(tmp_path):
     made = reference_labels(sequence, detector=RedSquares(), classifier=Namer())
     assert made(0).class_names == ("large",)  # 32 pixels and the margin of a still
     assert made.class_set == ("large", "small")
-
-
-def test_a_detection_is_never_done_twice(tmp_path, monkeypatch):
-    """A study that was killed goes on where it was."""
-    from hvt_common.inference.detect import OnnxDetector
-
-    write_visdrone(tmp_path / "root", "a")
-    (sequence,) = open_dataset(f"visdrone:{tmp_path / 'root'}?labels=none")
-    (tmp_path / "memory").mkdir()
-    settings = {"confidence": 0.1, "provider": "cpu", "folder": tmp_path / "memory"}
-    detector = CachedDetector("aerial-nano", **settings)
-    first = reference_labels(sequence, detector=detector)
-    assert len(list((tmp_path / "memory").iterdir())) == len(first.frames) == 3
-    again = CachedDetector("aerial-nano", **settings)
-    monkeypatch.setattr(OnnxDetector, "detect", lambda *_: pytest.fail("asked again"))
-    second = reference_labels(sequence, detector=again)
-    for index, labels in first.frames.items():
-        assert np.array_equal(labels.boxes_xyxy_px, second(index).boxes_xyxy_px)

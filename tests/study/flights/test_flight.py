@@ -131,14 +131,6 @@ def test_who_reads_a_flight_sees_all_of_it_and_changes_nothing(rough_clip):
     assert len(stills) == report.messages["roi"] > 0
 
 
-def test_stills_cross_and_are_counted(rough_clip):
-    """Without them the comparison would be of video with video."""
-    report = flown(rough_clip, *STILLS)
-    assert report.messages["roi"] > 0
-    assert sum(report.account.outcomes["sent"].values()) == report.messages["roi"]
-    assert report.bps("roi") == report.account.roi_bps
-
-
 def test_tracks_are_sent_while_the_base_hides_what_they_tell(clip):
     """On a large object that any video shows, tracks and their bits are wasted; where it is hidden they are all."""
 
