@@ -135,8 +135,8 @@ def read_recordings(paths: Sequence[Path], *, locator: Locator = NOWHERE) -> Rec
         UserError: a file is no recording of hvt-ground, or they are of several sessions.
     """
     spool = Spool()
-    opened = (_opened(path, spool, number) for number, path in enumerate(paths))
-    files = sorted(opened, key=lambda one: one.first)
+    named = {path.resolve(): path for path in paths}.values()  # one that is named twice is read once
+    files = sorted((_opened(path, spool, at) for at, path in enumerate(named)), key=lambda one: one.first)
     names = {one.whose for one in files}
     rows: _Rows = {}
     for file in files:

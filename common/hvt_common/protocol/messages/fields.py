@@ -29,6 +29,10 @@ class WireError(Exception):
     """A message that cannot be used; the text says why. Count it and skip it."""
 
 
+class _UnsendableError(ValueError):
+    """Says which value: those around it have nothing to add."""
+
+
 class Kind(ABC):
     """A field's type, bounds and coding."""
 
@@ -39,8 +43,10 @@ class Kind(ABC):
         try:
             raw = self._encode(value)
             self.decode(raw)  # what we send is held to the same rules as what we receive
+        except _UnsendableError:
+            raise
         except (WireError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            raise ValueError(f"{value!r} cannot be sent: {error}") from error
+            raise _UnsendableError(f"{value!r} cannot be sent: {error}") from error
         return raw
 
     @abstractmethod

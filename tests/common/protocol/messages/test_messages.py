@@ -421,6 +421,8 @@ def test_our_own_values_out_of_bounds_are_a_bug_and_say_so():
     """A wrong value would be sent and refused on the other side, far from its cause."""
     with pytest.raises(ValueError, match=r"^-1 cannot be sent: -1 is outside 0…18446744073709551615"):
         BaseHeader(session_id=-1, sequence=0, frame_index=0, capture_ns=0, send_delay_ns=0, flags=0).pack()
+    with pytest.raises(ValueError, match=r"^9{20} cannot be sent: [^{]*$"):
+        ControlRequest(session_id=0, command="still", arguments={"frame": int("9" * 20)}).pack()
     with pytest.raises(ValueError, match=rf"at most {MAX_STILL_RESULTS} are allowed"):
         Feedback(
             **{name: getattr(FEEDBACK, name) for name, _ in kinds(Feedback) if name != "stills"},
