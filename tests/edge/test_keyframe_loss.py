@@ -12,7 +12,7 @@ import pytest
 
 from hvt_common.protocol.messages import Flags
 from hvt_common.values import AccessUnit
-from hvt_edge.link.in_flight import BaseInFlight
+from hvt_edge.link.pacer import BaseInFlight
 from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_ground.link.reassemble import Arrival, Reassembler
 from rigs.messages import UnitHeader

@@ -8,7 +8,7 @@ import pytest
 
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.stage import Outage
-from hvt_edge.link.in_flight import BaseInFlight
+from hvt_edge.link.pacer import BaseInFlight
 
 S = 1_000_000_000
 
