@@ -40,6 +40,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
 from hvt_edge.link.pacer import BaseInFlight, Pacer
+from hvt_edge.link.stills import Still
 
 STILL_ATTACHMENT_BYTES = 55
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
