@@ -281,8 +281,10 @@ class Refiner:
         return replace(still, event=event, outcome=outcome)
 
     def _unmatched(self, still: StillSeen, outcome: Outcome) -> StillSeen:
-        doubted = self._vocabulary.says_nothing(still.posterior.class_name)
-        event = replace(still.event, doubted=doubted, vague=self.tilt.vague_of(still.event))
+        doubted, event = self._vocabulary.says_nothing(still.posterior.class_name), still.event
+        known = self.tilt.aslant is False and event.confidence > SURE
+        doubted |= are_apart(event.class_before, event.class_after) and not known
+        event = replace(event, doubted=doubted, vague=self.tilt.vague_of(event))
         return replace(still, event=event, outcome=outcome)
 
     # The posterior of each track.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -195,6 +196,11 @@ def test_unless_seen_from_above_no_kind_of_vehicle_has_a_check_mark(aslant):
     assert flown(words, walker, base=person, confidence=0.8, aslant=aslant).sure.tolist() == [True]
     shown, (event,) = told(words, car, base=person, confidence=0.3, aslant=aslant)
     assert (shown.words, event.doubted) == (("something",), True)
+    refiner = Refiner("fuse", fps=15, vocabulary=words, calibrated=True, tilt=tilt_of(aslant))
+    alone = seen(0, 0, car, (10, 10, 50, 40), edge=1, side_px=30.0)
+    alone = replace(alone, event=replace(alone.event, class_before="pedestrian", class_after="car"))
+    refiner.offer(alone, now_frame=0)
+    assert [done.event.doubted for done in refiner.end()] == [True], "nor in a still of no track"
 
 
 @pytest.mark.parametrize(
