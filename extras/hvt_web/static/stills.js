@@ -7,7 +7,7 @@ const MOST = 60;
 
 /** @typedef {{id: string, edge: string, frame: number, captured: number, shows: string[], track: number | null,
  *    before: string, after: string, sureness: number, reason: string, why: string, stored: boolean, unread: boolean,
- *    doubted: boolean, note: string}} Still */
+ *    doubted: boolean, note: string, box: number[], crop: number[] | null}} Still x1, y1, x2, y2 in base pixels */
 
 export class Stills {
   /** @param {HTMLElement} list @param {HTMLDialogElement} large */
@@ -61,7 +61,9 @@ export class Stills {
         make("span", "none", pair);
         continue;
       }
-      const picture = make("img", "", pair);
+      const view = make("span", "view", pair);
+      const picture = make("img", "", view);
+      outline(still, view);
       picture.src = address(still, which);
       picture.loading = "lazy";
       picture.alt = which === "still" ? stillAlt(still) : BASE_ALT;
@@ -78,8 +80,10 @@ export class Stills {
   open(still) {
     for (const which of ["still", "base"]) {
       const picture = this.part(`#large-${which}`);
-      picture.parentElement.hidden = !still.shows.includes(which);
-      if (still.shows.includes(which)) picture.src = address(still, which);
+      picture.closest("figure").hidden = !still.shows.includes(which);
+      if (!still.shows.includes(which)) continue;
+      picture.src = address(still, which);
+      outline(still, picture.parentElement);
     }
     this.part("#large-text").textContent = stillTitle(still);
     this.large.showModal();
@@ -89,6 +93,18 @@ export class Stills {
   part(selector) {
     return this.large.querySelector(selector);
   }
+}
+
+/** Which of the objects of the still is meant. @param {Still} still @param {HTMLElement} view has the picture */
+function outline(still, view) {
+  view.querySelector("svg")?.remove();
+  if (!still.crop) return;
+  const [shown, meant] = [still.crop, still.box].map(([x, y, right, bottom]) => ({ x, y, width: right - x, height: bottom - y }));
+  const [frame, outlined] = ["svg", "rect"].map((kind) => document.createElementNS("http://www.w3.org/2000/svg", kind));
+  frame.setAttribute("viewBox", Object.values(shown).join(" "));
+  for (const [name, value] of Object.entries(meant)) outlined.setAttribute(name, `${value}`);
+  frame.append(outlined);
+  view.append(frame);
 }
 
 /** @param {Still} still @param {string} which */
