@@ -32,7 +32,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.labels import class_labels, first_synonym, read_labels
 from hvt_common.inference.letterbox import Preparation, as_bgr, prepared_as
-from hvt_common.inference.runtimes.first_steps import own_scaling
+from hvt_common.inference.runtimes.first_steps import own_steps
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.model_file import is_ir
 from hvt_common.inference.store import resolve_model
@@ -217,9 +217,8 @@ def _preparation(model: OnnxModel, classes: int) -> tuple[Preparation, str]:
         usual, why = _OPEN_MODEL_ZOO, "assumed, as the Open Model Zoo takes them"
     else:
         usual, why = Preparation.torchvision(), "assumed, as torchvision trains"
-    own = own_scaling(model.path)
-    if own is not None:
-        usual, why = usual.unless_scaled(own), "it scales them itself"
+    own = own_steps(model.path)
+    usual, why = usual.beside(own), why if own.top is None else "it scales them itself"
     if any(key.startswith("hvt.") for key in said):
         why = "its metadata say so"
     return prepared_as(model.path, said, usual), why

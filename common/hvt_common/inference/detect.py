@@ -23,7 +23,7 @@ from hvt_common.inference.labels import (
 )
 from hvt_common.inference.letterbox import Letterboxer, Preparation, as_bgr, prepared_as
 from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
-from hvt_common.inference.runtimes.first_steps import own_scaling
+from hvt_common.inference.runtimes.first_steps import own_steps
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
@@ -197,7 +197,7 @@ class OnnxDetector:
             self.head = choose_head(trial, wanted=head)
         except UserError as error:
             raise UserError(_not_a_detector(model, str(error), channels_last=self._channels_last)) from None
-        usual = self.head.preparation.unless_scaled(own_scaling(model.path))
+        usual = self.head.preparation.beside(own_steps(model.path))
         self.preparation = prepared_as(model.path, model.metadata, usual)
         dtype = model.inputs[0].dtype
         assert dtype is not None

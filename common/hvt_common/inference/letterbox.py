@@ -16,6 +16,18 @@ from hvt_common.values import Boxes, Image
 
 
 @dataclass(frozen=True, slots=True)
+class OwnSteps:
+    """What a network does to its pixels itself."""
+
+    top: int | None = None
+    """The greatest pixel that it scales, 1 or 255; None where it scales none."""
+    rgb: bool | None = None
+    """Whether red comes first behind ``turned``; None where nothing tells."""
+    turned: bool = False
+    """It swaps red and blue."""
+
+
+@dataclass(frozen=True, slots=True)
 class Preparation:
     """Network value = (pixel - mean) * scale, channel by channel, pixels 0…255, in the network's channel order."""
 
@@ -29,12 +41,14 @@ class Preparation:
         """The preparation of torchvision and the ONNX model zoo for ImageNet."""
         return cls(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 / 57.12, 1 / 57.375))
 
-    def unless_scaled(self, own: tuple[int, bool | None] | None) -> Preparation:
-        """Plain pixels for a network that scales them itself (`own_scaling`); this for one that does not, as most."""
-        if own is None:
-            return self
-        top, red_first = own
-        return Preparation((0.0,) * 3, (top / 255,) * 3, rgb=self.rgb if red_first is None else red_first)
+    def beside(self, own: OwnSteps) -> Preparation:
+        """What is left to do for a network that does these steps itself."""
+        rgb = (self.rgb if own.rgb is None else own.rgb) != own.turned
+        if own.top is not None:
+            return Preparation((0.0,) * 3, (own.top / 255,) * 3, rgb=rgb)
+        step = -1 if own.turned else 1
+        (red, green, blue), (of_red, of_green, of_blue) = self.mean[::step], self.scale[::step]
+        return Preparation((red, green, blue), (of_red, of_green, of_blue), rgb=rgb)
 
     def __str__(self) -> str:
         order = "RGB" if self.rgb else "BGR"

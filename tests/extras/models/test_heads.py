@@ -76,10 +76,23 @@ def test_channels_may_come_last(tmp_path: Path, family: str, dtype: int) -> None
     assert "channels last" in detector.pixels
 
 
-def test_a_network_that_divides_its_pixels_gets_them_whole(tmp_path: Path) -> None:
-    """They would be divided twice, and nothing found without a word."""
-    path = scaling_inside(family_model(tmp_path / "m.onnx", "yolov8"), [("Div", 255)])
-    check(opened(path), "yolov8")
+@pytest.mark.parametrize("form", [".onnx", ".xml"])
+@pytest.mark.parametrize(
+    "steps",
+    [[("Div", 255)], [("Sub", 0), ("Div", [255] * 3)], [("Gather", [2, 1, 0])]],
+    ids=lambda one: one[0][0],
+)
+def test_what_a_network_does_to_its_pixels_itself_is_not_done_before(
+    tmp_path: Path, steps: list[tuple[str, object]], form: str
+) -> None:
+    """They would be divided twice, and nothing found without a word; or red would be blue."""
+    path = scaling_inside(family_model(tmp_path / "m.onnx", "yolov8", metadata=NAMED), steps)
+    if form == ".xml":
+        openvino = pytest.importorskip("openvino")
+        openvino.save_model(openvino.convert_model(path), path.with_suffix(form))
+    detector = opened(path.with_suffix(form))
+    check(detector, "yolov8")
+    assert detector.class_names[0] in NAMED["names"]
 
 
 @pytest.mark.parametrize("channels_last", [False, True])

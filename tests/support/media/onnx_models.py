@@ -51,10 +51,13 @@ def scaling_inside(path: Path, steps: Sequence[tuple[str, object]]) -> Path:
     first = last = graph.input[0].name
     nodes = []
     for number, (kind, value) in enumerate(steps):
-        made, extra = f"scaled{number}", {"to": TensorProto.FLOAT} if kind == "Cast" else {}
+        made = f"scaled{number}"
+        extra = {"Cast": {"to": TensorProto.FLOAT}, "Gather": {"axis": 1}}.get(kind, {})
         inputs = [last] if value is None else [last, f"by{number}"]
         if value is not None:
             numbers = np.array(value, np.float32).reshape(-1, 1, 1)
+            if kind == "Gather":
+                numbers = np.array(value, np.int64)
             graph.initializer.append(numpy_helper.from_array(numbers, f"by{number}"))
         nodes.append(helper.make_node(kind, inputs, [made], **extra))
         last = made

@@ -1,21 +1,23 @@
-"""Whether an ONNX network scales its pixels itself, and which pixels it expects then; read from its file."""
+"""Whether a network scales its pixels itself or turns their colours round, read from its file: ONNX or OpenVINO's."""
 
 from __future__ import annotations
 
 import mmap
 from dataclasses import dataclass, field
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.runtimes.model_file import GRAPH_FIELD, fields_of, is_ir
+from hvt_common.inference.letterbox import OwnSteps
+from hvt_common.inference.runtimes.model_file import GRAPH_FIELD, fields_of, files_of, is_ir
 
 # Field numbers of onnx.proto.
 _NODE, _INITIALIZER, _INPUT = 1, 5, 11
 _NODE_INPUT, _NODE_OUTPUT, _NODE_KIND, _NODE_ATTRIBUTE, _ATTRIBUTE_TENSOR = 1, 2, 4, 5, 5
 _TENSOR_TYPE, _TENSOR_FLOATS, _TENSOR_NAME, _TENSOR_RAW = 2, 4, 8, 9
-_TYPES = {1: "<f4", 10: "<f2", 11: "<f8"}
+_TYPES = {1: "<f4", 6: "<i4", 7: "<i8", 10: "<f2", 11: "<f8"}
 _MOST_BYTES = 64
 _MOST_STEPS = 12
 _SAME = frozenset({"Cast", "Identity", "Transpose", "Squeeze", "Unsqueeze", "Reshape"})
@@ -24,6 +26,10 @@ _BYTE_SLOPE, _BYTE_MEAN = 0.05, 10.0
 """A smaller slope, or a larger mean, is for pixels of 0…255."""
 _IMAGENET_MEANS, _NEAR = (123.7, 116.4, 103.7), 3.0
 """Of red, green, blue."""
+
+_IR_KINDS = {"Convert": "Cast", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}
+"""OpenVINO's operators that have another name."""
+_IR_TYPES = {"f16": "<f2", "f32": "<f4", "f64": "<f8", "i32": "<i4", "i64": "<i8"}
 
 _Numbers = npt.NDArray[np.float64]
 
@@ -37,47 +43,91 @@ class _Node:
     """Of a constant."""
 
 
-def own_scaling(path: Path) -> tuple[int, bool | None] | None:
-    """(greatest pixel, RGB) that a checked ONNX file expects; None where its first step is no scaling, as of most.
-
-    The greatest pixel is 1 or 255. Whether red comes first is told by means alone; else None.
-    """
-    if is_ir(path):
-        return None
+def own_steps(path: Path) -> OwnSteps:
+    """What a checked file does to its pixels before all else; nothing, as most."""
     try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            spans = [span[3:] for span in fields_of(data, 0, len(data)) if span[0] == GRAPH_FIELD]
-            slope, offset = _first_steps(data, *(spans or [(0, 0)])[-1])
-    except (OSError, ValueError):  # it is another now than the one that was opened
-        return None
+        graph = _ir_graph(path) if is_ir(path) else _onnx_graph(path)
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        ET.ParseError,
+    ):  # it is another now than the one that was opened
+        return OwnSteps()
+    slope, offset, turned = _first_steps(*graph)
     if slope is None:
-        return None
+        return OwnSteps(turned=turned)
     bytes_expected = slope.max() < _BYTE_SLOPE or (slope.max() <= 1 and np.abs(offset).max() > _BYTE_MEAN)
     top = 255 if bytes_expected else 1
     means = -offset / slope * (255 / top)
     orders = {True: _IMAGENET_MEANS, False: _IMAGENET_MEANS[::-1]}
     near = (first for first, known in orders.items() if np.abs(means - known).max() < _NEAR)
-    return top, next(near, None)
+    return OwnSteps(top, next(near, None), turned)
 
 
-def _first_steps(data: mmap.mmap, start: int, end: int) -> tuple[_Numbers | None, _Numbers]:
-    # value = pixel * slope + offset, one number or three each; no slope where the first step is no scaling.
-    at, users, constants = _graph(data, start, end)
-    slope, offset, scaled = np.ones(1), np.zeros(1), False
+def _first_steps(
+    at: str, users: dict[str, list[_Node]], constants: dict[str, _Numbers | None]
+) -> tuple[_Numbers | None, _Numbers, bool]:
+    # value = pixel * slope + offset, one number or three each; no slope where the first step is no scaling. And
+    # whether the first channel became the last.
+    slope, offset, scaled, reversed_ = np.ones(1), np.zeros(1), False, False
     for _ in range(_MOST_STEPS):
         (node, *others) = users.get(at) or (_Node(),)
-        if others or node.kind not in _SAME | _ARITHMETIC:
+        if others or node.kind not in _SAME | _ARITHMETIC | {"Gather"}:
             break
-        if node.kind in _ARITHMETIC:
-            by = constants.get(next((name for name in node.inputs if name != at), ""))
-            turned = node.kind in ("Sub", "Div") and node.inputs[0] != at
-            if by is None or by.size not in (1, 3) or turned or not (np.isfinite(by) & (by != 0)).all():
+        by = constants.get(next((name for name in node.inputs if name != at), ""))
+        if node.kind == "Gather":
+            if by is None or by.tolist() != [2, 1, 0]:
                 break
-            factor = {"Mul": by, "Div": 1 / by}.get(node.kind, np.ones(1))
-            more = {"Add": by, "Sub": -by}.get(node.kind, np.zeros(1))
-            slope, offset, scaled = slope * factor, offset * factor + more, True
+            slope, offset, reversed_ = slope[::-1], offset[::-1], not reversed_
+        if node.kind in _ARITHMETIC:
+            adds, first = node.kind in ("Add", "Sub"), node.kind in ("Add", "Mul") or node.inputs[0] == at
+            if by is None or by.size not in (1, 3) or not first or not np.isfinite(by).all():
+                break
+            if adds:
+                offset = offset + (by if node.kind == "Add" else -by)
+            elif by.all():
+                factor = by if node.kind == "Mul" else 1 / by
+                slope, offset = slope * factor, offset * factor
+            else:
+                break
+            scaled = scaled or not adds or bool(by.any())  # to add nothing is no step
         at = node.output
-    return (np.abs(slope) if scaled else None), offset
+    return (np.abs(slope) if scaled else None), offset, reversed_
+
+
+def _ir_graph(path: Path) -> tuple[str, dict[str, list[_Node]], dict[str, _Numbers | None]]:
+    # The same of OpenVINO's two files.
+    model, weights = files_of(path)
+    root = ET.parse(model).getroot()  # noqa: S314 - checked: no entities
+    nodes: dict[str, _Node] = {}
+    constants: dict[str, _Numbers | None] = {}
+    users: dict[str, list[_Node]] = {}
+    with weights.open("rb") as file:
+        for layer in root.iterfind("layers/layer"):
+            number, kind = layer.get("id", ""), layer.get("type", "")
+            nodes[number] = _Node(_IR_KINDS.get(kind, kind), output=number)
+            data = layer.find("data")
+            if kind == "Const" and data is not None and 0 < int(data.attrib["size"]) <= _MOST_BYTES:
+                file.seek(int(data.attrib["offset"]))
+                dtype = _IR_TYPES.get(data.get("element_type", ""))
+                value = file.read(int(data.attrib["size"]))
+                constants[number] = np.frombuffer(value, dtype).astype(np.float64) if dtype else None
+    edges = sorted(root.iterfind("edges/edge"), key=lambda edge: int(edge.get("to-port", "0")))
+    for edge in edges:
+        source, node = edge.attrib["from-layer"], nodes[edge.attrib["to-layer"]]
+        node.inputs.append(source)
+        users.setdefault(source, []).append(node)
+        if node.kind == "Cast" and source in constants:  # kept in half precision
+            constants[node.output] = constants[source]
+    first = next((number for number, node in nodes.items() if node.kind == "Parameter"), "")
+    return first, users, constants
+
+
+def _onnx_graph(path: Path) -> tuple[str, dict[str, list[_Node]], dict[str, _Numbers | None]]:
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        spans = [span[3:] for span in fields_of(data, 0, len(data)) if span[0] == GRAPH_FIELD]
+        return _graph(data, *(spans or [(0, 0)])[-1])
 
 
 def _graph(

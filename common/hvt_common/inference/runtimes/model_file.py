@@ -254,7 +254,7 @@ def check_ir_file(path: Path) -> None:
 
 
 def ir_metadata(path: Path) -> dict[str, str]:
-    """The ``model_info`` of an IR, names as in ONNX: ``names`` of the classes, and whatever else it says.
+    """The ``model_info`` of an IR, and what its ONNX file said, by ONNX's names: ``names`` of the classes, and so on.
 
     ``mean_values``, ``scale_values`` and ``reverse_input_channels``, of BGR pixels, become ``hvt.mean`` and so on.
     Ultralytics writes its own into ``metadata.yaml`` beside the file: its plain values and names are read too. Raises
@@ -262,10 +262,11 @@ def ir_metadata(path: Path) -> dict[str, str]:
     """
     check_ir_file(path)
     try:
-        found = ET.parse(path).getroot().find("rt_info/model_info")  # noqa: S314 - checked: no entities
+        root = ET.parse(path).getroot()  # noqa: S314 - checked: no entities
     except (ET.ParseError, OSError) as error:
         raise UserError(f"model {path} is not an OpenVINO model, or is cut short ({error})") from error
-    said = {one.tag: one.get("value", "") for one in (found if found is not None else ())}
+    places = ("framework", "model_info")  # the first has what the ONNX file said that it was made of
+    said = {one.tag: one.get("value", "") for place in places for one in root.iterfind(f"rt_info/{place}/*")}
     metadata = _yaml_of_ultralytics(path.with_name("metadata.yaml"))
     labels = said.pop("labels", "").split()
     if labels and "names" not in metadata:
@@ -273,8 +274,13 @@ def ir_metadata(path: Path) -> dict[str, str]:
     return _pixels_of_model_info(said) | said | metadata
 
 
+_YES = ("yes", "true", "1")
+
+
 def _pixels_of_model_info(said: Mapping[str, str]) -> dict[str, str]:
-    found = {}
+    found: dict[str, str] = {}
+    if said.get("embedded_processing", "").lower() in _YES:  # they are steps of the graph
+        return found
     mean, divisors = (said.get(key, "").strip("[]() ") for key in ("mean_values", "scale_values"))
     if mean or divisors:
         found["hvt.mean"] = mean or "0"
@@ -282,7 +288,7 @@ def _pixels_of_model_info(said: Mapping[str, str]) -> dict[str, str]:
             divisors = " ".join(str(1 / float(one)) for one in (divisors or "1").replace(",", " ").split())
         found["hvt.scale"] = divisors
     if "reverse_input_channels" in said:
-        turned = said["reverse_input_channels"].lower() in ("yes", "true", "1")
+        turned = said["reverse_input_channels"].lower() in _YES
         found["hvt.channel_order"] = "RGB" if turned else "BGR"
     return found
 
