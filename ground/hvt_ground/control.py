@@ -240,7 +240,8 @@ class RemoteEdge:
         answer = self._commanded(command, arguments or {})
         if answer is None:
             present = self._query(Channel.INFO, b"") is not None
-            raise UserError(control_unanswered(self.name, who="this key") if present else self._absent())
+            why = control_unanswered(self._session, self.name, who="this key") if present else self._absent()
+            raise UserError(why)
         return answer
 
     def _wait(

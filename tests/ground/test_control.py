@@ -57,10 +57,12 @@ class ScriptedEdge:
         self.puts: list[tuple[bytes, bytes]] = [(DATA, HEADER.pack(DATA))]
         self.asked: list[ControlRequest] = []
         self.puts_at = "still"
-        self.ends = False
+        self.ends, self.answers = False, True
 
-    def control(self, question: bytes) -> bytes:
+    def control(self, question: bytes) -> bytes | None:
         """Note the request."""
+        if not self.answers:
+            return None
         request = ControlRequest.parse(question)
         self.asked.append(request)
         if request.command == self.puts_at and self.answer.accepted:
@@ -183,6 +185,11 @@ def test_an_answer_that_is_none_is_a_sentence(edge):
             edges["uav-9"].keyframe()
         with pytest.raises(UserError, match="edge id 'UAV 1'"):
             edges["UAV 1"].keyframe()
+        edge.answers = False  # and nobody looks for rights where there are no keys
+        with pytest.raises(
+            UserError, match=r"uav-1 does not answer on control: the link is full, or has lost it$"
+        ):
+            edges["uav-1"].keyframe()
 
 
 def test_the_command_finds_the_only_edge_and_writes_the_file_as_it_came(edge, tmp_path, capsys):

@@ -157,11 +157,13 @@ def link_doctor() -> LinkDoctor:
     )
 
 
-def control_unanswered(edge: str, *, who: str = "this ground") -> str:
+def control_unanswered(session: zenoh.Session, edge: str, *, who: str = "this ground") -> str:
     """The sentence for a request on ``control`` without an answer, while the edge is present.
 
-    The edge itself, or a ground or a router on the way, may have dropped it: all of them check rights.
+    With keys the edge itself, or a ground or a router on the way, may have dropped it: all of them check rights.
     """
+    if not any(link.auth_identifier for link in session.info.links()):
+        return f"{edge} does not answer on control: the link is full, or has lost it"
     return (
         f"{edge} does not answer on control: {who} may lack the right to command it (hvt-ground keys list shows who "
         f"has it; add-ground without --watch-only gives it, then copy {edge}.json5 to the edge, and the others that "

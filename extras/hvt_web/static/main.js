@@ -14,7 +14,6 @@ const STATE_OLD_MS = 4000; // one comes each second
 const PERIODS = 8; // between pictures
 const KEYFRAME_MS = 8000;
 const MOST_EVENTS = 200;
-const SET_MS = 30000;
 const METHODS = ["M0", "M1", "M2", "M3", "M4", "M5", "M6"];
 
 /** @param {string} id @returns {any} */
@@ -43,11 +42,6 @@ let connected = false;
 let refused = false;
 let connectedAt = performance.now();
 let stateAt = -Infinity;
-/**
- * When this page last set something, by edge.
- * @type {Map<string, number>}
- */
-const setAt = new Map();
 /** Empty before there is one. */
 let chosen = "";
 let rungs = Player.rungs();
@@ -90,7 +84,10 @@ function onMessage(message, payload) {
       forgetEvents();
       break;
     case "session":
-      if (sessions.get(message.edge)?.session !== message.session) wall.event(message.edge, ""); // it begins anew
+      if (sessions.get(message.edge)?.session !== message.session) {
+        wall.event(message.edge, ""); // it begins anew
+        asked.delete(message.edge);
+      }
       if (mine && sessions.get(chosen)?.session !== message.session) forget(); // with other frames
       sessions.set(message.edge, message);
       if (mine) describe();
@@ -415,11 +412,7 @@ async function set(content, now) {
   const edge = chosen;
   confirm(words.askingSetting(edge, now));
   const reply = await post(`/edges/${encodeURIComponent(edge)}/settings`, content);
-  if (typeof reply !== "string") {
-    Object.assign(sessions.get(edge) ?? {}, now);
-    setAt.set(edge, performance.now());
-    asked.set(edge, now);
-  }
+  if (typeof reply !== "string") asked.set(edge, now);
   if (edge !== chosen) return;
   confirm(typeof reply === "string" ? reply : words.agreedSetting(edge, now));
   describe();
@@ -432,18 +425,21 @@ async function set(content, now) {
  */
 function confirmSet(edge, state) {
   const now = asked.get(edge);
-  if (!now || (now.budget ?? state.budget) !== state.budget || (now.method ?? state.method) !== state.method) return;
-  asked.delete(edge);
-  setAt.delete(edge);
-  if (edge === chosen) confirm(words.settingInForce(now));
+  if (!now || state.budget === null) return;
+  const before = sessions.get(edge) ?? state;
+  const names = /** @type {("budget" | "method")[]} */ (Object.keys(now));
+  const came = names.every((name) => state[name] === now[name]);
+  if (came || names.some((name) => state[name] !== before[name])) asked.delete(edge); // or somebody set another
+  if (came && edge === chosen) confirm(words.settingInForce(now));
 }
 
-/** What the edge flies with now; not under somebody's fingers. */
+/** What the edge flies with now, or has agreed to; not under somebody's fingers. */
 function showSettings() {
   const session = sessions.get(chosen);
   if (!session || by("commands").contains(document.activeElement)) return;
-  by("budget").value = String(Math.round(session.budget / 1000));
-  by("method").value = session.method;
+  const { budget, method } = { ...session, ...asked.get(chosen) };
+  by("budget").value = String(Math.round(budget / 1000));
+  by("method").value = method;
 }
 
 for (const name of METHODS) make("option", "", by("method")).textContent = name;
@@ -471,9 +467,8 @@ function onGroundState(message) {
     states.set(edge, { ...state, failed: [...state.failed, ...message.failed] });
     if (state.total !== null) plot.add(edge, { at: message.at, total: state.total, base: state.base, budget: state.budget });
     const session = sessions.get(edge);
-    const fresh = performance.now() - (setAt.get(edge) ?? -Infinity) < SET_MS; // the ground learns of it later
     confirmSet(edge, state);
-    if (session && state.budget !== null && !fresh) Object.assign(session, { budget: state.budget, method: state.method });
+    if (session && state.budget !== null) Object.assign(session, { budget: state.budget, method: state.method });
     if (edge !== chosen) continue;
     describe();
     showState(/** @type {Message} */ (states.get(edge)));

@@ -193,7 +193,7 @@ class EdgePort:
         # Say once that nothing is answered: a question without the right to ask is dropped in silence.
         self._unanswered = 0 if answered else self._unanswered + 1
         if self._unanswered == _UNANSWERED and self.present.is_set():
-            _log.warning("%s", control_unanswered(self.edge))
+            _log.warning("%s", control_unanswered(self.session, self.edge))
 
     def report(self, feedback: Feedback) -> None:
         try:

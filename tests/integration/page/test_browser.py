@@ -319,9 +319,19 @@ def test_an_operator_sets_the_budget(flight):
     def said(words: str) -> bool:
         return words in page.locator("#settings-text").text_content()
 
+    page.evaluate("""() => {
+      window.early = [];
+      const text = (id) => document.getElementById(id).textContent;
+      new MutationObserver(() => {
+        if (/not in force/.test(text("settings-text"))) window.early.push(text("facts"));
+      }).observe(document.body, {subtree: true, childList: true});
+    }""")
     page.locator("#budget").fill("300")
     page.locator("#budget-form button").click()
     eventually(lambda: said("300 kbps is in force"), what="the edge flies with it")
+    early = page.evaluate("window.early")
+    assert early, "agreed before it is in force"
+    assert not any("300 kbps" in one for one in early), "the budget of now stands alone"
     assert "300 kbps" in page.locator("#facts").text_content()
     page.locator("#budget").fill("10")
     page.locator("#budget-form button").click()
