@@ -285,14 +285,23 @@ def test_labels_that_count_frames_or_pixels_otherwise_than_images_are_refused(tm
     truth = tmp_path / "MOT17-02" / "gt" / "gt.txt"
     rows = [line.split(",", 1) for line in truth.read_text().splitlines()]
     truth.write_text("".join(f"{int(frame) - 1},{rest}\n" for frame, rest in rows))
-    with pytest.raises(UserError, match="images from 1, and its annotations count frames from 0"):
+    with pytest.raises(UserError, match="has images 1 to 6, and its annotations are of frames 0 to 5"):
         open_dataset(f"mot:{tmp_path}")
     with pytest.raises(UserError, match="accepted is a frame number from 1 on"):
         read_truth_rows(truth, ["x"] * 13)
     truth.write_text("".join(f"{frame},{rest}\n" for frame, rest in rows))
     for image in sorted((tmp_path / "MOT17-02" / "img1").iterdir()):
         image.rename(image.with_stem(f"{int(image.stem) - 1:06d}"))
-    with pytest.raises(UserError, match="images from 0, and its annotations count frames from 1"):
+    with pytest.raises(UserError, match="has images 0 to 5, and its annotations are of frames 1 to 6"):
+        open_dataset(f"mot:{tmp_path}")
+    for image in sorted(
+        (tmp_path / "MOT17-02" / "img1").iterdir(), reverse=True
+    ):  # a part, whose labels begin anew
+        image.rename(image.with_stem(f"{int(image.stem) + 4:06d}"))
+    with pytest.raises(UserError, match="has images 4 to 9, and its annotations are of frames 1 to 6"):
+        open_dataset(f"mot:{tmp_path}")
+    truth.write_text("10,1,20,20,9,9,1,1,1\n")
+    with pytest.raises(UserError, match="has images 4 to 9, and its annotations are of frames 10 to 10"):
         open_dataset(f"mot:{tmp_path}")
     truth.write_text("1,1,.2,.2,.1,.1,1,1,1\n")
     with pytest.raises(UserError, match=r"gt\.txt has boxes of 0 to 1"):
@@ -435,6 +444,8 @@ def test_clips_say_what_a_frame_shows(tmp_path, ending, fps):
     assert len(pictures) == sequence.clip_frames == -(-24 * 15 // fps)
     for frame_index, picture in enumerate(pictures):
         assert np.array_equal(picture, drawn[sequence.source_frame(frame_index)])
+    (given,) = open_dataset(f"clips:{tmp_path}?fps={fps}")
+    assert content_hash(given) != content_hash(sequence), "time stamps of that mean may show other frames"
 
 
 def test_a_broken_clip_is_named(tmp_path):

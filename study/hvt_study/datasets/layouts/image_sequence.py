@@ -68,17 +68,20 @@ class ImageSequence:
     ) -> Sequence:
         """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown.
 
-        Raises `UserError` where labels count frames from 0 and images from 1, or the reverse: all labels would be a
-        frame late, or early.
+        Raises `UserError` where labels count frames from another number on than images: all would be of other images.
         """
         frame_count = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
         known = None if labels is None else labels.table()
+        begins, count = self.first_number, self.frame_count
         first, last = (None, 0) if known is None else (known.first_frame, known.last_frame)
-        late = first == 0 and self.first_number == 1
-        if late or (first and self.first_number == 0 and last == self.frame_count):
+        if first is not None and (
+            not (begins <= last and first < begins + count)
+            or (first < begins and (begins == 1 or last - count in (-1, 0)))
+            or (first > begins == 0 and last == count)
+        ):
             raise UserError(
-                f"sequence folder {self.folder} counts its images from {self.first_number}, and its annotations count"
-                f" frames from {1 - self.first_number}: number them alike"
+                f"sequence folder {self.folder} has images {begins} to {begins + count - 1}, and its annotations are "
+                f"of frames {first} to {last}: number them alike"
             )
         found = () if labels is None else (path for path in labels.arguments if isinstance(path, Path))
         return Sequence(
@@ -180,7 +183,9 @@ def _open(name: str, path: Path, options: Options) -> Sequence:
     count, shown = source.shown_frames()
     source.close()
     clip = Clip(str(path), size, len(shown), source_fps=options.fps)
-    return replace(_unlabelled(name, path, clip, frame_count=count, fps=fps), source_frames=shown)
+    found = _unlabelled(name, path, clip, frame_count=count, fps=fps)
+    given = {} if options.fps is None else {"rate": "given"}  # in place of time stamps of the very same mean
+    return replace(found, source_frames=shown, attributes=given)
 
 
 def _unlabelled(name: str, place: Path, clip: Clip, *, frame_count: int, fps: float) -> Sequence:
