@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import os
+import platform
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
@@ -22,7 +23,7 @@ from hvt_common.errors import UserError
 
 DETECTING = ("hvt_common", "hvt_models")
 """Has a say in what a detector finds."""
-FLYING = (*DETECTING, "hvt_codecs", "hvt_edge", "hvt_ground", "hvt_study")
+FLYING = (*DETECTING, "hvt_codecs", "hvt_edge", "hvt_ground", "hvt_scene", "hvt_study")
 """Has one in a flight and its figures."""
 _BESIDE = ("hvt_study/commands", "hvt_study/report")
 """Has no say in a flight or in its figures."""
@@ -143,7 +144,7 @@ def write_whole(path: Path, body: bytes) -> None:
 
     Raises `CacheError` where it cannot be written.
     """
-    scratch = path.with_suffix(f".{os.getpid()}")
+    scratch = path.with_name(f"{path.name}.{platform.node()}-{os.getpid()}")  # containers share numbers
     try:
         path.parent.mkdir(exist_ok=True)
         scratch.write_bytes(_checksum(body) + body)

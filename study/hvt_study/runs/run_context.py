@@ -24,6 +24,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.labels import default_confidence, first_synonym
+from hvt_common.inference.runtimes.model_file import files_of
 from hvt_common.inference.store import MOTION, resolve_model
 from hvt_common.inference.tiles import tiled
 from hvt_common.tracking.settings import weak_confidence
@@ -85,7 +86,7 @@ def open_materials(spec: RunSpec, *, cache: Path) -> Materials:
         detector=detector,
         edge_detector=_detector("edge", spec.models.edge_detector, spec.models.provider, memory),
         classifier=classifier,
-        content={"clip": digest, **_model_digests(spec.models)},
+        content={"clip": digest, **model_digests(spec.models)},
         software={**software_versions(), "provider": detector.model.provider.provider},
     )
 
@@ -129,12 +130,13 @@ def _classifier(spec: str, provider: str) -> Classifier | None:
 
 
 @lru_cache(maxsize=4)
-def _model_digests(models: ModelChoice) -> dict[str, str]:
+def model_digests(models: ModelChoice) -> dict[str, str]:
+    """Of all files of each network, by its role; a process reads them once."""
     named = {"detector": models.detector, "edge_detector": models.edge_detector}
     if models.classifier not in (DETECTOR, NONE):
         named["classifier"] = models.classifier
     return {
-        role: file_digest(resolve_model(one, role="classifier" if role == "classifier" else "detector"))
+        role: " ".join(map(file_digest, files_of(resolve_model(one, role=role.removeprefix("edge_")))))
         for role, one in named.items()
     }
 

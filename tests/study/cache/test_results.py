@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
 
@@ -19,7 +22,8 @@ from hvt_study.cache.results import (
     flight_code,
     tree_digest,
 )
-from hvt_study.runs.run_context import software_versions
+from hvt_study.runs.run_context import model_digests, software_versions
+from hvt_study.runs.spec import ModelChoice
 
 
 def test_a_result_comes_back_as_it_was(tmp_path):
@@ -45,6 +49,21 @@ def test_a_damaged_result_is_made_again(tmp_path, damage, caplog):
     assert "damaged" in caplog.text
     cache.put("abcdef", {"total_bps": 555})
     assert cache.get("abcdef") == {"total_bps": 555}
+
+
+def test_two_machines_may_keep_the_same_at_once(tmp_path, monkeypatch):
+    """Containers all have the same few process numbers: one would take the other's half file away."""
+    hosts, replace = iter(("one", "other")), Path.replace
+
+    def late(scratch, target):
+        monkeypatch.setattr(Path, "replace", replace)
+        ResultCache(tmp_path).put("abcdef", {"total_bps": 1})
+        return replace(scratch, target)
+
+    monkeypatch.setattr("platform.node", lambda: next(hosts))
+    monkeypatch.setattr(Path, "replace", late)
+    ResultCache(tmp_path).put("abcdef", {"total_bps": 2})
+    assert ResultCache(tmp_path).get("abcdef") == {"total_bps": 2}
 
 
 def test_a_folder_that_cannot_be_is_told_in_a_sentence(tmp_path):
@@ -103,6 +122,25 @@ def test_what_runs_here_is_in_every_row():
     assert len(flight_code()) == 16
     assert code_digest("hvt_common") != flight_code()
     assert {"machine", "pillow", "msgpack"} <= versions.keys()
+
+
+def test_all_that_a_flight_loads_is_its_code():
+    """A scene that is drawn otherwise would get the flights over the old one."""
+    asked = "import hvt_study.runs.execute, sys; print(*{one.partition('.')[0] for one in sys.modules})"
+    loaded = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True).stdout
+    assert {one for one in loaded.split() if one.startswith("hvt_")} <= set(FLYING)
+
+
+@pytest.mark.parametrize("part", ["net.xml", "net.bin", "metadata.yaml"])
+def test_a_network_goes_by_all_of_its_files(tmp_path, part):
+    """An OpenVINO model that was trained again has other weights beside the same description."""
+    for name in ("net.xml", "net.bin", "metadata.yaml"):
+        (tmp_path / name).write_text("<net/>")
+    models = ModelChoice(f"{tmp_path}/net.xml", f"{tmp_path}/net.xml", f"{tmp_path}/net.xml")
+    before = model_digests(models)
+    (tmp_path / part).write_text("<net></net>")
+    model_digests.cache_clear()
+    assert all(model_digests(models)[role] != digest for role, digest in before.items())
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def test_boxes_follow_the_camera_on_every_way(root):
     assert [one.name for one in sequences] == [f"street-{seed}" for seed in range(4)]
     checked = 0
     for sequence in sequences:
-        assert sequence.attributes == {"view": "0.6", "seed": sequence.name[-1]}
+        assert (sequence.attributes["view"], sequence.attributes["seed"]) == ("0.6", sequence.name[-1])
         for index, image in enumerate(sequence.clip.images()):
             if index % 35:
                 continue

@@ -10,7 +10,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_study.datasets.layouts.uri import open_dataset
-from hvt_study.datasets.sequence import stage_clip
+from hvt_study.datasets.sequence import content_hash, stage_clip
 from hvt_study.datasets.virtual_camera import VirtualCamera, open_camera, read_annotations
 
 BOX = (300, 200, 40, 24)  # x, y, w, h of a white block
@@ -135,6 +135,8 @@ def test_yolo_labels_lie_where_visdrones_do(picture):
         np.allclose(box, (xs.min(), ys.min(), xs.max() + 1, ys.max() + 1), atol=1.01)
         for box in found.boxes_xyxy_px
     )
+    (turned,) = open_dataset(f"still:{moved}?classes=dontcare,person,truck&view=0.9")
+    assert content_hash(turned) != content_hash(sequence), "the flight would have the labels of the other"
     (only,) = open_dataset(f"still:{root}?classes=dontcare,truck,person&labelled=vehicle")
     assert only.class_set == ("truck",)
     with pytest.raises(UserError, match="labels none of boat"):

@@ -221,6 +221,7 @@ def _varint(data: bytes, start: int) -> tuple[int, int]:
 
 _MAX_XML_BYTES = 64 << 20
 _FIRST_BYTES = 512
+_ULTRALYTICS = "metadata.yaml"
 
 
 def is_ir(path: Path) -> bool:
@@ -229,8 +230,9 @@ def is_ir(path: Path) -> bool:
 
 
 def files_of(path: Path) -> tuple[Path, ...]:
-    """The files that a model is: itself, and of an IR the weights beside it."""
-    return (path, path.with_suffix(".bin")) if is_ir(path) else (path,)
+    """The files that a model is: itself, and beside an IR the weights, and what Ultralytics says of them."""
+    said = path.with_name(_ULTRALYTICS)
+    return (path, path.with_suffix(".bin"), *[said] * said.is_file()) if is_ir(path) else (path,)
 
 
 def check_ir_file(path: Path) -> None:
@@ -238,7 +240,7 @@ def check_ir_file(path: Path) -> None:
     if not path.is_file():
         state = "is not a file" if path.exists() else "does not exist"
         raise absent(path)(f"model {path} {state}; an OpenVINO .xml with its .bin is expected")
-    _, weights = files_of(path)
+    weights = files_of(path)[1]
     if not weights.is_file():
         raise UserError(f"model {path} has no {weights.name} beside it; OpenVINO keeps the weights there")
     for part, most in ((path, _MAX_XML_BYTES), (weights, MAX_MODEL_BYTES)):
@@ -267,7 +269,7 @@ def ir_metadata(path: Path) -> dict[str, str]:
         raise UserError(f"model {path} is not an OpenVINO model, or is cut short ({error})") from error
     places = ("framework", "model_info")  # the first has what the ONNX file said that it was made of
     said = {one.tag: one.get("value", "") for place in places for one in root.iterfind(f"rt_info/{place}/*")}
-    metadata = _yaml_of_ultralytics(path.with_name("metadata.yaml"))
+    metadata = _yaml_of_ultralytics(path.with_name(_ULTRALYTICS))
     labels = said.pop("labels", "").split()
     if labels and "names" not in metadata:
         metadata["names"] = repr([label.replace("_", " ") for label in labels])

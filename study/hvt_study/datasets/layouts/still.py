@@ -77,6 +77,7 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
     view = float(f"{options.view or USUAL_VIEW:g}")  # as it is written in the clip's name
     camera = _camera(picture, view, seed, options.annotated, options.classes, _stamps(picture))
     known = camera.annotations
+    named = () if known is None else known.class_names  # in the order of the file, which has but numbers
     return Sequence(
         name=name,
         dataset="still",
@@ -86,7 +87,7 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
         source_size=camera.size,
         labels=None if known is None else partial(still_labels, picture, view, seed, options.classes),
         class_set=camera.class_set,
-        attributes={"view": f"{view:g}", "seed": str(seed)},
+        attributes={"view": f"{view:g}", "seed": f"{seed}", "classes": ",".join(dict.fromkeys(named))},
         files=(picture,) if known is None else (picture, annotation_file(picture)),
     )
 
