@@ -214,6 +214,14 @@ def _provenance(rows: Sequence[RunRow]) -> Iterator[Part]:
     mixed = [name for name, each in said.items() if len(each) > 1]
     if mixed:
         yield f"Runs of different versions are mixed here: {', '.join(mixed)}."
+    contents: dict[str, set[str]] = {}
+    for row in rows:
+        for role, digest in table_of(row["content"]).items():
+            name = sequence_of(row) if role == "clip" else row.get(role, role)
+            contents.setdefault(name, set()).add(str(digest))
+    changed = [name for name, each in contents.items() if len(each) > 1]
+    if changed:
+        yield f"Files of one name and other content are mixed here: {', '.join(changed)}."
     yield (
         "Every row of results.parquet has the full configuration (config), the software (versions), hashes of the "
         "clip and the models (content) and of all payloads (digest), in the columns of these names."

@@ -130,6 +130,17 @@ def test_software_that_differs_is_named_where_nothing_else_does():
     settings([rows[0], {**rows[1], "matched": False}])
 
 
+def test_files_that_were_replaced_under_their_names_are_told():
+    """M5 with a network, and M6 with what was trained since under the same name: no figure of theirs compares."""
+    old, new = (json.dumps({"clip": "c", "detector": one, "edge_detector": one}) for one in ("1", "2"))
+    rows = [row("a", "M5", 1, 0.5, content=old), row("a", "M6", 1, 0.5, content=new)]
+    said = [
+        [part for part in make_report(both).sections[-1].parts if "other content" in part]
+        for both in (rows, rows[:1])
+    ]
+    assert said == [["Files of one name and other content are mixed here: nano."], []]
+
+
 def test_parameters_that_differ_between_sequences_make_no_mean():
     """Half of a mean with weights that were searched for is neither the one method nor the other."""
     rows = [row("a", "M5", 1, 0.5), row("b", "M5", 1, 0.5, config=config(tune=["area=2"]))]
