@@ -181,7 +181,8 @@ def _rounded(value: float) -> float:
 
 
 def _worth(row: Mapping[str, Any]) -> float:
-    return 0.0 if row["failed"] or row["named_f1"] is None else float(row["named_f1"])
+    figure = row["recall"] if row["named_f1"] is None else row["named_f1"]  # of one target
+    return 0.0 if row["failed"] else float(figure or 0.0)
 
 
 _MOST_TRIALS = 100_000
@@ -246,7 +247,7 @@ def _print(found: Mapping[str, Any], written: Path) -> None:
         for one in found["held_out"]
     )
     heads = ("sequence", "regime", "default", "tuned", "kbps", "kbps")
-    title = "held out: objects shown with their class, of all"
+    title = "held out: named F1; of one target recall"
     print_columns(title, heads, rows, words=("sequence", "regime"), gap=2)
     flags = ",".join(f"{name}={value:g}" for name, value in found["parameters"].items())
     print_lines(

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import Executor, Future
+from pathlib import Path
 
 import pytest
 
 from hvt_common.errors import UserError
 from hvt_study.cache.results import ResultCache
 from hvt_study.cli import main
-from hvt_study.commands.tune import split, tunable
+from hvt_study.commands.tune import split, tunable, tune
+from hvt_study.matrix.plan import StudyPlan, parse_regimes
 from hvt_study.matrix.tuning import tuned_methods
+from hvt_study.runs.spec import ModelChoice
 from studies.small_study import arguments, write_scene
 
 NAMES = ("north", "east", "west")
@@ -53,6 +57,33 @@ def test_a_search_is_judged_on_what_it_has_not_seen(scene, tmp_path, capsys):
     assert tunes.count(()) == 3  # as it is, on all three
     assert len(set(tunes) - {()}) == 2  # two proposals
     assert len(tunes) == 3 + 2 * 2 + (found["train_tuned"] > found["train_default"])
+
+
+def test_of_one_target_recall_is_searched_for():
+    """Named F1 cannot be said of it: every trial would be worth nothing, and the defaults win by that."""
+    plan = StudyPlan(
+        sequences=(("mot:a", "one"), ("mot:a", "two")),
+        methods=(),
+        regimes=parse_regimes("300kbps"),
+        still_codecs=("jpeg",),
+        models=(ModelChoice("aerial-nano", "aerial-nano"),),
+        labels="annotations",
+        cache=Path("nowhere"),
+    )
+
+    class Flown(Executor):
+        def submit(self, _, spec):
+            row = {"named_f1": None, "recall": 0.5 + 0.1 * bool(spec.tune), "failed": "", "total_bps": 1}
+            done = Future()
+            done.set_result(
+                {"dataset": spec.dataset, "sequence": spec.sequence, "regime": spec.regime, **row}
+            )
+            return done
+
+    train, held_out = plan.sequences[:1], plan.sequences[1:]
+    own = {"method": "M5", "parameters": tunable("M5"), "train": train, "held_out": held_out, "trials": 1}
+    found = tune(plan, **own, pool=Flown())
+    assert (found["train_default"], found["held_out_gain"]) == (0.5, pytest.approx(0.1))
 
 
 def test_what_cannot_be_tuned_is_told(scene, tmp_path, capsys):
