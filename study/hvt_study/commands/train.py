@@ -225,7 +225,10 @@ def _read(pictures: Sequence[LabelledPicture]) -> list[_Own]:
 
 
 def _split(data: Sequence[list[_Own]], apart: Sequence[list[_Own]]) -> tuple[list[_Own], list[_Own]]:
-    """What is trained on, and what is held out: the last fifth of each, for neighbours of a clip are alike."""
+    """What is trained on, and what is held out: the last fifth of each, for neighbours of a clip are alike.
+
+    A picture that is in both is held out.
+    """
     total = sum(map(len, (*data, *apart)))
     if total < _LEAST_PICTURES:
         raise UserError(
@@ -236,11 +239,13 @@ def _split(data: Sequence[list[_Own]], apart: Sequence[list[_Own]]) -> tuple[lis
         last = 0 if apart else max(1, len(pictures) // _HELD_OUT_SHARE)
         train += pictures[: len(pictures) - last]
         held_out += pictures[len(pictures) - last :]
+    measured = {own.path.resolve() for own in held_out}
+    train = [own for own in train if own.path.resolve() not in measured]
     every = math.ceil(len(held_out) / _MOST_HELD_OUT)
     held_out = held_out[::every] if every else held_out
     for name, part in (("train on", train), ("hold out", held_out)):
         if not any(len(own.labels) for own in part):
-            raise UserError(f"the pictures to {name} have no labelled object: label more, or give --held-out")
+            raise UserError(f"the pictures to {name} have no labelled object: label more, or hold out others")
     return train, held_out
 
 

@@ -191,6 +191,10 @@ def test_what_cannot_be_is_one_sentence(tmp_path, water, capsys):
     assert "there is no folder" in refused(capsys, *data, "--out", tmp_path / "no/b.onnx")
     assert "--minutes 0.0 is not accepted" in refused(capsys, *data, *out, "--minutes", "0")
     assert "start 'aerial-nan' is not known" in refused(capsys, *data, *out, "--start", "aerial-nan")
+    both = refused(capsys, *data, *out, "--held-out", f"yolo:{water}")
+    assert "the pictures to train on have no labelled object" in both, (
+        "it would be measured on what it learnt"
+    )
     for path in sorted((water / "labels").iterdir())[4:]:
         path.unlink()
     assert "--data has 4 labelled pictures that can be read: 10 are needed" in refused(capsys, *data, *out)
