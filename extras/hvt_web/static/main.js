@@ -437,9 +437,9 @@ function confirmSet(edge, state) {
 function showSettings() {
   const session = sessions.get(chosen);
   if (!session || by("commands").contains(document.activeElement)) return;
-  const { budget, method } = { ...session, ...asked.get(chosen) };
-  by("budget").value = String(Math.round(budget / 1000));
-  by("method").value = method;
+  const now = asked.get(chosen);
+  by("budget").value = String(Math.round((now?.budget ?? session.budget) / 1000));
+  by("method").value = now?.method ?? session.method;
 }
 
 for (const name of METHODS) make("option", "", by("method")).textContent = name;

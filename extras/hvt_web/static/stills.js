@@ -95,7 +95,10 @@ export class Stills {
   }
 }
 
-/** Which of the objects of the still is meant. @param {Still} still @param {HTMLElement} view has the picture */
+/**
+ * Which of the objects of the still is meant.
+ * @param {Still} still @param {HTMLElement} view has the picture
+ */
 function outline(still, view) {
   view.querySelector("svg")?.remove();
   if (!still.crop) return;
