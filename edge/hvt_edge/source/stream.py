@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -10,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import av
+import av.container.core
 import av.error
 
 from hvt_common.errors import NotYetError, UserError
@@ -148,14 +152,44 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
             times.clear()
 
 
+class _PyAvClock:
+    # PyAV passes over what comes under a number that is not there at the start, as of another program, and begins to
+    # count its timeout anew at each. From the time that `packets_of` says on, its clock runs away, and it gives up.
+
+    here = threading.local()
+    _leaps = itertools.count(1)
+
+    @classmethod
+    def monotonic(cls) -> float:
+        now_s = time.monotonic()
+        late = now_s > getattr(cls.here, "until_s", math.inf)
+        return now_s + 3600 * next(cls._leaps) if late else now_s
+
+
+av.container.core.time = _PyAvClock  # type: ignore[attr-defined]
+
+
 def packets_of(container: Any, stream: Any) -> Iterator[Any]:
-    """The packets of the film as they come. Raises `SignalLost` where for ten seconds sound or data alone came."""
-    came_s = time.monotonic()
-    for packet in container.demux():  # of the film alone it would not return while others come
-        if packet.stream.index == stream.index:
+    """The packets of the film as they come. Raises `SignalLost` where for ten seconds all else alone came."""
+    packets = container.demux()  # of the film alone it would not return while others come
+    until_s = time.monotonic() + _UNDECODED_S
+    while True:
+        packet: Any = None
+        _PyAvClock.here.until_s = until_s
+        try:
+            packet = next(packets)
+        except (StopIteration, IndexError):  # the second as in `container.packets_of`
+            return
+        except av.error.ExitError:
+            if time.monotonic() <= until_s:
+                raise
+        finally:
+            _PyAvClock.here.until_s = math.inf
+        late = time.monotonic() > until_s
+        if packet is not None and packet.stream.index == stream.index:
             yield packet
-            came_s = time.monotonic()
-        elif time.monotonic() - came_s > _UNDECODED_S:
+            until_s = time.monotonic() + _UNDECODED_S
+        if late:
             raise SignalLost("it sends no picture")
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import itertools
+import socket
+import threading
+from contextlib import suppress
 from fractions import Fraction
 from types import SimpleNamespace
 
@@ -19,17 +22,17 @@ from hvt_edge.source.opening import open_source
 from hvt_edge.source.stream import StreamGrabber
 
 
-def film_that_stops() -> io.BytesIO:
-    """MPEG-TS: ten pictures, sound beside them and for long after."""
+def film_that_stops(*, pictures: int = 10, tones: int = 200, **options: str) -> io.BytesIO:
+    """MPEG-TS: pictures, sound beside them and for long after."""
     data = io.BytesIO()
-    with av.open(data, "w", format="mpegts") as output:
+    with av.open(data, "w", format="mpegts", options=options) as output:
         film, sound = output.add_stream("libx265", rate=25), output.add_stream("mp2", rate=48_000)
         film.width, film.height, film.options = 128, 64, {"tune": "zerolatency", "x265-params": "log-level=0"}
-        for number in range(10):
+        for number in range(pictures):
             picture = av.VideoFrame.from_ndarray(np.full((64, 128, 3), number, np.uint8), format="rgb24")
             output.mux(film.encode(picture))
         output.mux(film.encode(None))
-        for number in range(200):
+        for number in range(tones):
             tone = av.AudioFrame.from_ndarray(np.zeros((1, 2 * 1152), np.int16), layout="stereo")
             tone.sample_rate, tone.pts, tone.time_base = 48_000, 1152 * number, Fraction(1, 48_000)
             output.mux(sound.encode(tone))
@@ -50,6 +53,34 @@ def test_a_camera_of_which_sound_alone_goes_on_has_stopped(monkeypatch, grabber)
     with pytest.raises(SignalLost, match="no picture"):
         all(iter(camera.grab, None))
     camera.close()
+
+
+def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(tmp_path, monkeypatch):
+    """It was dark for ever: PyAV passes over each packet of it, and waits for more of the one before."""
+    seconds = itertools.count()
+    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
+    one, other = (
+        film_that_stops(pictures=100, tones=0, **options).getvalue()
+        for options in (
+            {},
+            {"mpegts_service_id": "7", "mpegts_pmt_start_pid": "496", "mpegts_start_pid": "300"},
+        )
+    )
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def send():
+            with server.accept()[0] as line, suppress(OSError):
+                for data in (one, *itertools.repeat(other, 500)):
+                    line.sendall(data)
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        camera = StreamGrabber(f"tcp://127.0.0.1:{server.getsockname()[1]}")
+        camera.open()
+        with pytest.raises(SignalLost, match="no picture"):
+            all(iter(camera.grab, None))
+        camera.close()
+        sender.join()
 
 
 @pytest.mark.parametrize("coded", [False, True])
