@@ -32,8 +32,8 @@ from hvt_study.cache.results import (
 
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""
-_digest_of_file = cache(file_digest)
-"""Once in a process: a model that is changed under a running study is not noticed by it."""
+digest_of_file = cache(file_digest)
+"""Once in a study: a model that is changed under a running one is not noticed by it."""
 
 
 class CachedDetector(OnnxDetector):
@@ -48,7 +48,7 @@ class CachedDetector(OnnxDetector):
             open_model(path, settings=ModelSettings(threads=1, provider=provider)), confidence=confidence
         )
         said = (
-            *(_digest_of_file(file.resolve()) for file in files_of(path)),
+            *(digest_of_file(file.resolve()) for file in files_of(path)),
             self.model.provider.provider,
             f"{confidence:g}",
             f"code {code_digest(*DETECTING)}",

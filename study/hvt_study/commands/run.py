@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
@@ -25,7 +24,7 @@ from hvt_study.report.data.table_file import RESULTS, read_results, write_result
 from hvt_study.report.example.choice import choose_run, load_example, save_example
 from hvt_study.report.example.fly_again import fly_again
 from hvt_study.report.write import write_report
-from hvt_study.runs.execute import run_spec
+from hvt_study.runs.execute import runner
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,11 +46,9 @@ def run(arguments: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     plan = study_plan(arguments, open_sequences(arguments))
     table = make_out(arguments.out, name=RESULTS)
-    earlier = _earlier(table)
-    check_parameters(plan, earlier, out=arguments.out)
-    rows = _flown(plan, arguments, table, earlier)
-    others = staying(rows, earlier)
-    _write([*rows, *others], arguments, table)
+    check_parameters(plan, _earlier(table), out=arguments.out)
+    rows = _flown(plan, arguments, table)
+    others = _write(rows, arguments, table)
     _add_example(rows, plan, arguments.out)
     write_report(arguments.out)
     failed = [row for row in rows if row["failed"]]
@@ -59,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(f"every run failed, the first: {_failure(failed[0])}")
     say(f"{len(rows)} runs, {len(failed)} failed: {arguments.out / 'report.html'}")
     if others:
-        say(f"{len(others)} runs of earlier studies stay beside them: for these alone name another --out")
+        say(f"{others} runs of earlier studies stay beside them: for these alone name another --out")
     return 0
 
 
@@ -78,13 +75,14 @@ def _earlier(table: Path) -> list[RunRow]:
         return []
 
 
-def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> None:
-    write_results(in_accounting(rows, arguments.accounting), table)
+def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> int:
+    """Write them, and behind them what stays of the table as it is by now; returns how many those are."""
+    others = staying(rows, _earlier(table))
+    write_results(in_accounting([*rows, *others], arguments.accounting), table)
+    return len(others)
 
 
-def _flown(
-    plan: StudyPlan, arguments: argparse.Namespace, table: Path, earlier: list[RunRow]
-) -> list[RunRow]:
+def _flown(plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> list[RunRow]:
     done: list[RunRow] = []
     pool, at_once = open_pool(arguments)
     progress = RunProgress("runs")
@@ -97,15 +95,12 @@ def _flown(
 
     try:
         with progress, pool as workers:
-            # Workers may have been started elsewhere.
-            fly = partial(run_spec, cache=plan.cache, folder=Path.cwd())
-            return run_all(plan, pool=workers, run=fly, at_once=at_once, on_row=on_row)
+            return run_all(plan, pool=workers, run=runner(plan.cache), at_once=at_once, on_row=on_row)
     except BaseException:
         if done:
             with suppress(UserError):  # what ended the study is what is said
-                others = staying(done, earlier)
-                _write([*in_order(plan, done), *others], arguments, table)
-                beside = f", and {len(others)} of before" if others else ""
+                others = _write(in_order(plan, done), arguments, table)
+                beside = f", and {others} of before" if others else ""
                 progress.note(
                     f"{len(done)} finished runs are in {table}{beside}; the same command goes on from there"
                 )

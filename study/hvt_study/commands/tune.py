@@ -7,7 +7,6 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from hvt_study.commands.arguments import (
 from hvt_study.commands.output import RunProgress, make_out, print_columns, print_lines, writing
 from hvt_study.matrix.plan import StudyPlan, spec_of
 from hvt_study.matrix.tuning import tuning_texts
-from hvt_study.runs.execute import run_spec
+from hvt_study.runs.execute import runner
 from hvt_study.runs.methods import METHODS as FLOWN
 
 _REACH = 4.0
@@ -147,7 +146,7 @@ def _flown(
         for models in plan.models
         for regime in plan.regimes
     ]
-    run = partial(run_spec, cache=plan.cache, folder=Path.cwd())  # as of workers started elsewhere
+    run = runner(plan.cache)
     rows = [future.result() for future in [pool.submit(run, spec) for spec in specs]]
     for row in rows:
         if row["failed"] and not texts:

@@ -12,8 +12,10 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
+from uuid import uuid4
 
 from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import Channel
@@ -34,7 +36,7 @@ from hvt_study.metrics.observed import (
 )
 from hvt_study.metrics.tracking import continuity, tracking_score
 from hvt_study.runs.methods import METHODS
-from hvt_study.runs.run_context import Materials, RunContext, open_materials, open_run_context
+from hvt_study.runs.run_context import Materials, RunContext, begin_study, open_materials, open_run_context
 from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flown, settings
 from hvt_study.runs.spec import COLUMNS, RunSpec, located
 from hvt_study.runs.video_shape import VideoShape, competing_sizes, first_budget, match, search_shape, within
@@ -155,17 +157,25 @@ def _plain(value: Any) -> Any:
 RunRow = dict[str, Any]
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
+_STUDY = uuid4().hex
 _in_flight = threading.Lock()
 """Flights of one process take turns with its detectors; a Dask worker may have several threads."""
 
 
-def run_spec(spec: RunSpec, *, cache: Path, folder: Path = Path()) -> RunRow:
+def runner(cache: Path) -> Callable[[RunSpec], RunRow]:
+    """`run_spec` for the study of this process, to be called in workers that may have been started elsewhere."""
+    return partial(run_spec, cache=cache, folder=Path.cwd(), study=_STUDY)
+
+
+def run_spec(spec: RunSpec, *, cache: Path, folder: Path = Path(), study: str = "") -> RunRow:
     """Do one run; what the edge refuses, or no one has foreseen, is a row that says so.
 
-    Paths that are not absolute begin at ``folder``, such as the one in which the study was started. A `UserError`
-    ends the study: dataset or models cannot be used, or the cache not be written.
+    Paths that are not absolute begin at ``folder``, such as the one in which the study was started; files are taken
+    to be the same as long as it is the same ``study``. A `UserError` ends it: dataset or models cannot be used, or
+    the cache not be written.
     """
     with _in_flight:
+        begin_study(study)
         here = located(spec, folder=folder)
         found = open_materials(here, cache=cache)
         flights = _Flights(spec, cache, found, here)

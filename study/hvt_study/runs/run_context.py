@@ -29,7 +29,7 @@ from hvt_common.inference.store import MOTION, resolve_model
 from hvt_common.inference.tiles import tiled
 from hvt_common.tracking.settings import weak_confidence
 from hvt_ground.config import DETECTOR, NONE
-from hvt_study.cache.cached_detector import CachedDetector
+from hvt_study.cache.cached_detector import CachedDetector, digest_of_file
 from hvt_study.cache.results import CacheError, ResultCache, content_key, file_digest, flight_code, installed
 from hvt_study.datasets.class_map import ClassMap, joint_classes
 from hvt_study.datasets.labels import FrameLabels
@@ -139,6 +139,13 @@ def model_digests(models: ModelChoice) -> dict[str, str]:
         role: " ".join(map(file_digest, files_of(resolve_model(one, role=role.removeprefix("edge_")))))
         for role, one in named.items()
     }
+
+
+@lru_cache(maxsize=1)
+def begin_study(study: str) -> None:  # noqa: ARG001 - another one is another call
+    """Forget what was opened for another study: a worker of Dask lives on while labels are mended, models trained."""
+    for known in (_sequence, _detector, _classifier, model_digests, _open, digest_of_file):
+        known.cache_clear()
 
 
 _OPEN_FILES = Path("/proc/self/fd")

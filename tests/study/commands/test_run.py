@@ -11,6 +11,7 @@ import pytest
 from hvt_study.cli import main
 from hvt_study.commands import run as command
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
+from hvt_study.report.data.table_file import write_results
 from hvt_study.runs import execute
 from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_context import open_materials, open_run_context
@@ -26,6 +27,7 @@ from studies.small_study import (
     entries,
     flights,
     table,
+    write_scene,
 )
 
 METHODS = ("--methods", "M0,M5,DDS", "--regimes", REGIME)
@@ -152,6 +154,21 @@ def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkey
     assert len(table(out)) == len(before)
 
 
+def test_a_study_beside_another_in_one_folder_keeps_its_rows(scene, done, tmp_path, monkeypatch):
+    """Who starts the second half in another window would find the rows of one of them alone."""
+    own, other = table(done)[:1], table(done)[1:2]
+
+    def flown(*_, **__):
+        write_results(other, tmp_path / "results.parquet")  # ended in the meantime
+        return own
+
+    monkeypatch.setattr(command, "run_all", flown)
+    assert (
+        main(["run", *arguments(scene, tmp_path, "--methods", "M0", "--regimes", REGIME, "--jobs", "1")]) == 0
+    )
+    assert {row["key"] for row in table(tmp_path)} == {row["key"] for row in (*own, *other)}
+
+
 @pytest.mark.nightly
 def test_a_method_that_is_added_stands_beside_the_others(scene, done, tmp_path, capsys):
     """The table of a finished study would be gone without a word."""
@@ -203,6 +220,19 @@ def test_an_error_in_one_flight_is_one_row(scene, tmp_path, monkeypatch, caplog)
         full.setattr(execute, "flown", lambda *_, **__: (_ for _ in ()).throw(MemoryError))
         with pytest.raises(MemoryError):
             execute.run_spec(spec, cache=plan.cache)
+
+
+def test_a_worker_that_outlives_a_study_looks_at_files_anew(tmp_path, monkeypatch):
+    """Labels are mended, and the workers of a cluster would go on with the old ones, and find the old flights."""
+    uri = write_scene(tmp_path / "scene", "street")
+    (spec,) = first_runs(plan_of(uri, tmp_path / "cache"))
+    monkeypatch.setattr(execute, "flown", lambda *_, **__: {}["none"])
+    found = []
+    for study in ("one", "one", "two"):
+        found.append(execute.run_spec(spec, cache=tmp_path / "cache", study=study)["content"])
+        with (tmp_path / "scene" / "annotations" / "street.txt").open("a") as file:
+            file.write("1,99,0,0,9,9,1,4,0,0\n")
+    assert found[0] == found[1] != found[2]
 
 
 def test_a_classifier_names_the_reference_labels(scene, tmp_path):
