@@ -210,7 +210,8 @@ def _boxes_and_table(trial: Trial) -> tuple[int, int] | None:
     ]
     if len(pairs) > 1:  # four classes: the box is named so
         last = trial.named("pred_boxes", "pred_logits")
-        boxed = [pair for pair in pairs if "box" in trial.ports[pair[0]].name.lower()]
+        names = [trial.ports[boxes].name.lower() for boxes, _ in pairs]
+        boxed = [pair for pair, name in zip(pairs, names, strict=True) if "box" in name or "dets" in name]
         pairs = [pair for pair in boxed if pair == last] or boxed
     return pairs[0] if len(pairs) == 1 else None
 

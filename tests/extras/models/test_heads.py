@@ -153,6 +153,21 @@ def test_an_angle_is_no_class(tmp_path: Path, names: dict[str, str], *, transpos
         opened(constant_model(tmp_path / "m.onnx", table, size=(96, 64), metadata=names))
 
 
+@pytest.mark.parametrize("columns", [3, 4, 5])
+def test_rf_detr_may_have_any_number_of_classes(tmp_path: Path, columns: int) -> None:
+    """One of three classes and "none", as wide as its boxes, was refused, with --head rf-detr too."""
+    answers = {"dets": np.full((1, 100, 4), 0.4), "labels": np.full((1, 100, columns), -5.0)}
+    path = save(
+        tmp_path / "m.onnx",
+        [helper.make_node("Identity", [f"c_{name}"], [name]) for name in answers],
+        inputs={"images": (1, 3, 320, 320)},
+        outputs={name: value.shape for name, value in answers.items()},
+        constants={f"c_{name}": value.astype(np.float32) for name, value in answers.items()},
+    )
+    head = opened(path).head
+    assert (head.name, head.classes) == ("rf-detr", columns)
+
+
 def test_layers_that_only_training_reads_are_passed_over(tmp_path: Path) -> None:
     """An export of DETR's kind with its auxiliary outputs would be refused."""
     graph = Graph()
