@@ -182,8 +182,9 @@ def _endpoints(said: dict[str, Any], side: str) -> tuple[str, ...]:
 
 
 def connect_endpoints(config: zenoh.Config) -> tuple[str, ...]:
-    """The endpoints that a configuration connects to."""
-    return _endpoints({"connect": {"endpoints": json.loads(config.get_json("connect/endpoints"))}}, "connect")
+    """The endpoints that a configuration connects to; a link-local address with its interface in it."""
+    said = {"connect": {"endpoints": json.loads(config.get_json("connect/endpoints"))}}
+    return tuple(_IFACE.sub(r"\1%\3\2", one) for one in _endpoints(said, "connect"))
 
 
 def _split(endpoints: tuple[str, ...]) -> tuple[str, ...]:
@@ -199,10 +200,13 @@ def _split(endpoints: tuple[str, ...]) -> tuple[str, ...]:
 
 
 _ENDPOINT = re.compile(
-    r"(?P<protocol>tcp|tls|udp|quic|ws)/(?P<host>\[[0-9a-fA-F:.%\w]+\]|[\w.-]+):(?P<port>\d{1,5})"
+    r"(?P<protocol>tcp|tls|udp|quic|ws)/(?P<host>\[[0-9a-fA-F:.%\w-]+\]|[\w.-]+):(?P<port>\d{1,5})"
     r"(\?[!\"$-~]*)?(#[!-~]*)?",
     re.ASCII,
 )
+_SCOPE = re.compile(r"(\[fe[89ab][^%\]]*)%(?!\d+\])([^\]]+)(\][^#]*)#?", re.IGNORECASE)
+_IFACE = re.compile(r"(\[fe[89ab][^%\]]*)(\][^#]*)#(?:.*;)?iface=([^;]+).*", re.IGNORECASE)
+"""Of ``[fe80::1%eth0]`` Zenoh knows numbers alone, which change with the interface; here it knows names."""
 
 
 def _check_endpoint(endpoint: str) -> None:
@@ -217,8 +221,9 @@ def _check_endpoint(endpoint: str) -> None:
 def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) -> None:
     import zenoh  # noqa: PLC0415
 
+    scoped = [_SCOPE.sub(r"\1\3#iface=\2;", one).rstrip(";") for one in endpoints]
     try:
-        config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
+        config.insert_json5(f"{side}/endpoints", json.dumps(scoped))
     except zenoh.ZError as error:  # what stands behind ? and # is Zenoh's to judge
         reason = without_build_paths(re.sub(r".*msg: \"|\", location: .*", "", str(error)))
         raise UserError(f"--{side} {' '.join(endpoints)}: Zenoh does not accept it: {reason}") from None

@@ -34,7 +34,7 @@ from hvt_common.transport.session import (
     serve,
     subscribe,
 )
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 from programs.processes import eventually
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
@@ -198,6 +198,22 @@ def test_two_links_by_priority_are_asked_for_only_where_wanted(tmp_path):
     path.write_text("{ transport: { unicast: { max_links: 2 } } }")
     assert _links(LinkSettings("edge", connect=there, zenoh_config=path)) == (split, "2")
     assert _links(LinkSettings("ground"))[1] == "2", "who listens takes two from whoever asks"
+
+
+@pytest.mark.parametrize(
+    ("given", "zenohs"),
+    [
+        ("tcp/[fe80::1%eth0]:7447", "tcp/[fe80::1]:7447#iface=eth0"),
+        ("tls/[FE80::1%br-lan.4]:1?prio=1-3#dscp=0x88", "tls/[FE80::1]:1?prio=1-3#dscp=0x88;iface=br-lan.4"),
+        ("tcp/[fe80::1%3]:7447", "tcp/[fe80::1%3]:7447"),
+    ],
+)
+def test_a_link_local_endpoint_names_its_interface(given, zenohs):
+    """Zenoh looks for a machine of that name for ever: the edge never has a link."""
+    config, _ = configure(LinkSettings("edge", connect=(given,)))
+    assert json.loads(config.get_json("connect/endpoints")) == [zenohs]
+    # Whoever looks why there is no link has to go the same way.
+    assert connect_endpoints(config)[0].partition("#")[0] == given.partition("#")[0]
 
 
 def test_tls_links_do_not_hide_seconds_of_video_in_the_kernel():
