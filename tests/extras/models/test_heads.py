@@ -79,7 +79,7 @@ def test_channels_may_come_last(tmp_path: Path, family: str, dtype: int) -> None
 @pytest.mark.parametrize("form", [".onnx", ".xml"])
 @pytest.mark.parametrize(
     "steps",
-    [[("Div", 255)], [("Sub", 0), ("Div", [255] * 3)], [("Gather", [2, 1, 0])]],
+    [[("Div", 255)], [("Sub", 0), ("Div", [255] * 3)], [("Gather", [2, 1, 0])], [("Slice", [-1, -9, 1, -1])]],
     ids=lambda one: one[0][0],
 )
 def test_what_a_network_does_to_its_pixels_itself_is_not_done_before(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -44,7 +45,7 @@ def save(
     return path
 
 
-def scaling_inside(path: Path, steps: Sequence[tuple[str, object]]) -> Path:
+def scaling_inside(path: Path, steps: Sequence[tuple[str, Any]]) -> Path:
     """The model with these operators between its (N, 3, H, W) input and what takes it now, each with its constant."""
     model = onnx.load(path)
     graph = model.graph
@@ -53,14 +54,17 @@ def scaling_inside(path: Path, steps: Sequence[tuple[str, object]]) -> Path:
     for number, (kind, value) in enumerate(steps):
         made = f"scaled{number}"
         extra = {"Cast": {"to": TensorProto.FLOAT}, "Gather": {"axis": 1}}.get(kind, {})
-        inputs = [last] if value is None else [last, f"by{number}"]
-        if value is not None:
-            numbers = np.array(value, np.float32).reshape(-1, 1, 1)
-            if kind == "Gather":
-                numbers = np.array(value, np.int64)
-            graph.initializer.append(numpy_helper.from_array(numbers, f"by{number}"))
-        nodes.append(helper.make_node(kind, inputs, [made], **extra))
-        last = made
+        if kind == "Slice":
+            constants = [np.array([one], np.int64) for one in value]
+        elif value is None:
+            constants = []
+        else:
+            shape, dtype = ((-1,), np.int64) if kind == "Gather" else ((-1, 1, 1), np.float32)
+            constants = [np.array(value, dtype).reshape(shape)]
+        names = [f"by{number}_{place}" for place in range(len(constants))]
+        graph.initializer.extend(map(numpy_helper.from_array, constants, names))
+        nodes.append(helper.make_node(kind, [last, *names], [made], **extra))
+        last = last if kind == "Shape" else made
     for node in graph.node:
         node.input[:] = [last if name == first else name for name in node.input]
     rest = list(graph.node)

@@ -22,12 +22,21 @@ _MOST_BYTES = 64
 _MOST_STEPS = 12
 _SAME = frozenset({"Cast", "Identity", "Transpose", "Squeeze", "Unsqueeze", "Reshape"})
 _ARITHMETIC = frozenset({"Sub", "Add", "Mul", "Div"})
+_TURNING = {"Gather": 1, "Slice": 4, "StridedSlice": 3}
+"""What may put the last channel first, and the place of the input that says so."""
+_NO_PIXELS = frozenset({"Shape", "ShapeOf"})
 _BYTE_SLOPE, _BYTE_MEAN = 0.05, 10.0
 """A smaller slope, or a larger mean, is for pixels of 0…255."""
 _IMAGENET_MEANS, _NEAR = (123.7, 116.4, 103.7), 3.0
 """Of red, green, blue."""
 
-_IR_KINDS = {"Convert": "Cast", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}
+_IR_KINDS = {
+    "Convert": "Cast",
+    "Subtract": "Sub",
+    "Multiply": "Mul",
+    "Divide": "Div",
+    "Slice": "StridedSlice",  # with its inputs in that order
+}
 """OpenVINO's operators that have another name."""
 _IR_TYPES = {"f16": "<f2", "f32": "<f4", "f64": "<f8", "i32": "<i4", "i64": "<i8"}
 
@@ -72,12 +81,12 @@ def _first_steps(
     # whether the first channel became the last.
     slope, offset, scaled, reversed_ = np.ones(1), np.zeros(1), False, False
     for _ in range(_MOST_STEPS):
-        (node, *others) = users.get(at) or (_Node(),)
-        if others or node.kind not in _SAME | _ARITHMETIC | {"Gather"}:
+        (node, *others) = [one for one in users.get(at, []) if one.kind not in _NO_PIXELS] or [_Node()]
+        if others or node.kind not in _SAME | _ARITHMETIC | _TURNING.keys():
             break
         by = constants.get(next((name for name in node.inputs if name != at), ""))
-        if node.kind == "Gather":
-            if by is None or by.tolist() != [2, 1, 0]:
+        if node.kind in _TURNING:
+            if not _turns(node, constants):
                 break
             slope, offset, reversed_ = slope[::-1], offset[::-1], not reversed_
         if node.kind in _ARITHMETIC:
@@ -94,6 +103,11 @@ def _first_steps(
             scaled = scaled or not adds or bool(by.any())  # to add nothing is no step
         at = node.output
     return (np.abs(slope) if scaled else None), offset, reversed_
+
+
+def _turns(node: _Node, constants: dict[str, _Numbers | None]) -> bool:
+    said = constants.get("".join(node.inputs[_TURNING[node.kind] :][:1]))
+    return said is not None and (said.tolist() == [2, 1, 0] if node.kind == "Gather" else said.min() == -1)
 
 
 def _ir_graph(path: Path) -> tuple[str, dict[str, list[_Node]], dict[str, _Numbers | None]]:
