@@ -199,8 +199,8 @@ export function stillWords(still) {
   if (still.track === null && still.reason === "asked") return "a closer look"; // of a place, whatever is there
   const track = still.track === null ? "" : `track ${still.track}: `;
   if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
-  if (still.doubted) return `${track}doubted${still.before === still.after ? " as before" : `, was ${still.before}`}`;
   const sure = percent(still.sureness);
+  if (still.doubted) return `${track}doubted, ${still.before === still.after ? `${still.after} at ${sure}` : `was ${still.before}`}`;
   return still.before === still.after || !still.before ? `${track}${still.after}, ${sure}` : `${track}${still.before} → ${still.after}, ${sure}`;
 }
 

@@ -9,7 +9,7 @@ move, and lane marks stand in rows: who stands must be surer. A kind of vehicle 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from hvt_common.camera_motion import Affine
 from hvt_common.inference.class_names import group_of
 from hvt_common.values import Tracks
+from hvt_ground.events import Event, Refinement
 
 _LIKELY, _LIKELY_ODD = 0.5, 0.65
 """From this mean confidence on it is more likely right than not; a person, one much larger than others or on one."""
@@ -95,6 +96,13 @@ class Guesses:
     def among(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """(N,) True for those that were guesses in the newest list."""
         return np.array([one in self._ids for one in ids.tolist()], np.bool_)
+
+    def doubting(self, event: Event, *, sure: float) -> Event:
+        """What a still says, doubted where it is not so ``sure`` and its track is a guess, or it has none."""
+        if not isinstance(event, Refinement) or event.unread or event.confidence > sure:
+            return event
+        guess = event.track_id is None or bool(self.among(np.array([event.track_id]))[0])
+        return replace(event, doubted=event.doubted or guess)
 
     def agreed(
         self, ids: npt.NDArray[np.int64], names: Sequence[str], *, aslant: bool | None

@@ -153,6 +153,8 @@ class Pipeline:
         """When the one that was to be searched was captured, which another may have replaced."""
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
+        self._pending: list[Event] = []
+        """By stills, until it is known which tracks are guesses."""
         gap_frames = max(1, round(_GAP_S * fps))
         self._history = History(
             max_frames=min(_MOST_HISTORY_FRAMES, max(1, round(_HISTORY_S * fps))),
@@ -168,7 +170,7 @@ class Pipeline:
             fusion=parts.fusion,
             view=view,
             gap_frames=gap_frames,
-            emit=emit,
+            emit=self._pending.append,
         )
         self._detected_frame: int | None = None
         self._now = Progress()
@@ -232,6 +234,7 @@ class Pipeline:
             own = self._own = self._parts.tracker.extrapolated(frame_index=self._now.picture_index)
             self._parts.fusion.take_own(own)
             self._track_ids.add(self._revise(own).tracks.ids.tolist())
+            self._tell()
         return self.searching
 
     def pass_over(self, index: int, capture_ns: int) -> None:
@@ -265,10 +268,12 @@ class Pipeline:
             self._show(own, at_ns)
             return
         self._revise(own)
+        self._tell()
 
     def read(self, stills: Sequence[ReceivedStill]) -> None:
         """Take stills, in the order in which they came; those of one frame are looked at together."""
         self._stills.take(stills, self._now)
+        self._tell()
         self._carry_merges()
 
     def list_at(self, frame_index: int) -> Overlay:
@@ -295,6 +300,7 @@ class Pipeline:
         if self._detection is not None:
             self._detection.found.cancel()
         self._stills.end(self._now)
+        self._tell()
         self._history.clear()
 
     # The base stream
@@ -403,7 +409,15 @@ class Pipeline:
             self._doubted = int(shown.doubted.sum())
             if self._detection is not None and capture_ns - self._due_ns > _LATE_NS:
                 looked_ns = self._due_ns
+            self._tell()
             self._emit(replace(self._inside(self._doubting(shown)), looked_ns=looked_ns))
+        self._tell()
+
+    def _tell(self) -> None:
+        pending, guesses = self._pending, self._parts.guesses
+        while pending:
+            event = pending.pop(0)
+            self._emit(event if guesses is None else guesses.doubting(event, sure=SURE))
 
     def _doubting(self, shown: Overlay) -> Overlay:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the

@@ -337,6 +337,7 @@ def test_a_guess_stays_one_until_a_still_is_sure_of_it(flight, pictures, confide
             rig.pipeline.read([received(flight, 3, 0)])
     after = rig.of(Overlay)[-1]
     assert (after.refined.tolist(), after.doubted.tolist()) == ([True], [doubted])
+    assert [one.doubted for one in rig.of(Refinement)] == [doubted], "the list of stills says the same"
 
 
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from hvt_common.inference.class_names import is_nothing
 from hvt_common.protocol.messages import RoiHeader
 from hvt_common.runtime.statistics import Newest
 from hvt_common.values import Image
@@ -239,7 +240,8 @@ def _verdict(refinement: Refinement) -> str:
     if refinement.doubted and before != after:
         return f"{refinement.class_before}? {after} {certainty}"
     if before == after:
-        return f"{after} {certain}{certainty}"
+        doubt = "?" * (refinement.doubted and not is_nothing(after))
+        return f"{after}{doubt} {certain}{certainty}"
     if refinement.track_id is None:  # nothing was renamed by it
         return f"{before}, by itself {after} {certainty}"
     return f"{before} → {after} {certain}{certainty}"

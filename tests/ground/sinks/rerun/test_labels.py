@@ -163,6 +163,7 @@ def test_an_object_that_somebody_chose_is_named(tmp_path):
         ({"class_before": "van", "class_after": "bus", "vague": (True, True)}, "track 4: vehicle .95"),
         ({"class_after": "other", "doubted": True}, "track 4: doubted, car? other .95"),
         ({"class_before": "other", "class_after": "other", "doubted": True}, "track 4: doubted, other .95"),
+        ({"doubted": True}, "track 4: doubted, car? .95"),
         (
             {"track_id": None, "unread": True, "note": "waffle iron .31"},
             "edge track 5: car (waffle iron .31)",
