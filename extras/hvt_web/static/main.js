@@ -522,13 +522,12 @@ const actions = {
   keyframe,
 };
 for (const [id, act] of Object.entries(actions)) by(id).addEventListener("click", act);
-by("answer-close").addEventListener("click", () => {
-  by("answer").hidden = true;
-});
+by("answer-close").addEventListener("click", () => (by("answer").hidden = true));
 addEventListener("keydown", (event) => {
-  if (/** @type {Element} */ (event.target).closest("button, input, select") || by("large").open || event.ctrlKey || event.metaKey || event.altKey) return;
-  const act = { " ": "pause", ArrowLeft: "back", ArrowRight: "forward", l: "now", k: "keyframe" }[event.key];
+  if (/** @type {Element} */ (event.target).closest("button, input, select, summary") || by("large").open || event.ctrlKey || event.metaKey || event.altKey) return;
+  const act = { " ": "pause", ArrowLeft: "back", ArrowRight: "forward", l: "now", k: "keyframe", L: "now", K: "keyframe" }[event.key];
   if (!act) return;
   event.preventDefault();
   actions[act]();
 });
+addEventListener("hashchange", () => location.reload()); // the address names an edge or a rung anew

@@ -162,8 +162,9 @@ export class Player {
     return true;
   }
 
-  /** Play on from here. */
+  /** Play on from here; of single pictures none is kept. */
   play() {
+    if (this.stream < 0) return this.goLive();
     this.video.playbackRate = 1;
     this.video.play().catch(() => {});
   }

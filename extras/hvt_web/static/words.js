@@ -52,7 +52,7 @@ function lasting(ms) {
 export const kbps = (bps) => (bps >= 1e6 ? `${(bps / 1e6).toFixed(2)} Mbps` : `${Math.round(bps / 1e3)} kbps`);
 
 /** @param {number} ms */
-export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour12: false });
+export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hourCycle: "h23" });
 
 /** @param {number} share */
 const percent = (share) => `${Math.round(share * 100)} %`;

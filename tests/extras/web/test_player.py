@@ -66,3 +66,8 @@ def test_a_pause_that_fills_the_browsers_memory_keeps_the_picture():
       console.log(JSON.stringify([failed, player.live]));
     """)
     assert said == [False, False]
+
+
+def test_who_pauses_single_pictures_plays_on_with_the_newest():
+    """The button said Play, and the picture stood still for good."""
+    assert ran("player.pause(); player.play(); console.log(JSON.stringify(player.live));") is True

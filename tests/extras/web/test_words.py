@@ -174,7 +174,7 @@ _NO_TEXT = {
     "`${letter}px system-ui, sans-serif`",
     "`${11 * ratio}px system-ui, sans-serif`",
     '"(prefers-color-scheme: light)"',
-    '"button, input, select"',
+    '"button, input, select, summary"',
     '`${track.doubted ? "doubted" : ""} ${track.read ? "read" : ""}`',
     '`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`',
     '`video/mp4; codecs="${codec}"`',

@@ -219,6 +219,8 @@ def test_an_edge_that_is_not_here_is_not_another(flight):
     assert page.locator("#main").is_hidden()
     page.locator('.edge[data-edge="uav-1"]').click()
     shows(page)
+    page.evaluate("location.hash = 'edge=uav-9'")
+    page.locator("#absent").wait_for(state="visible")
     page.context.close()
 
 
@@ -258,8 +260,10 @@ def test_steps_back_and_to_the_picture_of_now(page):
     page.keyboard.press("ArrowLeft")
     eventually(lambda: frame(page) <= paused - 40, what="an earlier picture is shown")
     assert "ago" in page.inner_text("#age")
-    page.keyboard.press("l")
+    page.keyboard.press("Shift+L")
     shows(page, after=paused + 5)
+    page.locator("#why summary").press("Space")
+    assert page.locator("#why[open]").count(), "a key opens what it stands on"
 
 
 @pytest.mark.nightly
