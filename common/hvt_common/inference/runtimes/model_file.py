@@ -270,13 +270,20 @@ def ir_metadata(path: Path) -> dict[str, str]:
     places = ("framework", "model_info")  # the first has what the ONNX file said that it was made of
     said = {one.tag: one.get("value", "") for place in places for one in root.iterfind(f"rt_info/{place}/*")}
     metadata = _yaml_of_ultralytics(path.with_name(_ULTRALYTICS))
+    found = (root.find(f"{place}/reverse_input_channels") for place in _OF_CONVERSION)
+    turned = any(one is not None and one.get("value", "").lower() in _YES for one in found)
+    order = (
+        {"hvt.channel_order": "BGR"} if turned else {}
+    )  # it is no step of the graph, but in its first weights
     labels = said.pop("labels", "").split()
     if labels and "names" not in metadata:
         metadata["names"] = repr([label.replace("_", " ") for label in labels])
-    return _pixels_of_model_info(said) | said | metadata
+    return order | _pixels_of_model_info(said) | said | metadata
 
 
 _YES = ("yes", "true", "1")
+_OF_CONVERSION = ("rt_info/conversion_parameters", "rt_info/cli_parameters", "meta_data/cli_parameters")
+"""What OpenVINO's converter was told."""
 
 
 def _pixels_of_model_info(said: Mapping[str, str]) -> dict[str, str]:

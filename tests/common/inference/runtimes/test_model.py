@@ -388,6 +388,10 @@ def test_a_constant_that_would_fill_the_memory_is_not_made_when_the_model_is_ope
         ('<reverse_input_channels value="False"/>', {"hvt.channel_order": "BGR"}),
         ('<scale_values value="0"/>', {"hvt.mean": "0", "hvt.scale": "0"}),
         ('<scale_values value="255"/><embedded_processing value="True"/>', {}),
+        (
+            '</model_info><cli_parameters><reverse_input_channels value="True"/></cli_parameters><model_info>',
+            {"hvt.channel_order": "BGR"},
+        ),
     ],
 )
 def test_an_openvino_model_says_its_pixels(tmp_path: Path, said: str, expected: dict[str, str]) -> None:
