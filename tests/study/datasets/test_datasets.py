@@ -401,6 +401,7 @@ def test_mot_of_others(tmp_path):
         ({"info": "frameRate=25\n"}, r"expected is a section \[Sequence\]"),
         ({"info": "[Sequence]\nframeRate=25\nseqLength=9\n"}, "says seqLength=9 and has 6 images"),
         ({"info": "[Sequence]\nframeRate=25\nimDir=frames\n"}, "no folder frames"),
+        ({"rows": "1,1,1,1,9,9,1,4,0,1\n"}, "has VisDrone's ten columns"),
         ({"rows": "1,1,1,1,9,9,1,99,1\n"}, "line 1 is '1,1,1,1,9,9,1,99,1'"),
         ({"rows": "1,1,1,1,9,9,1,4.5,1\n"}, "line 1 is .* a class from 1 to 13"),
     ],

@@ -136,6 +136,10 @@ def _class_text(highest: int) -> str:
 def _kinds(rows: Rows, highest: int, *, own: bool) -> tuple[Rows, npt.NDArray[np.int64]]:
     """The rows whose class is known, and their classes from 1 on."""
     if not own and _in_the_world(rows):
+        if np.isin(rows["class"], np.arange(12)).all() and np.isin(rows["visibility"], (0, 1, 2)).all():
+            raise UserError(
+                f"{rows.path} has VisDrone's ten columns: lay the sequence out as visdrone: takes it"
+            )
         return rows, np.full(len(rows), _PEDESTRIAN, np.int64)
     known = np.isin(rows["class"], [-1, *range(1, highest + 1)])
     rows = rows.only(known, accepted=_class_text(highest))
