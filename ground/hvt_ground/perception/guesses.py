@@ -17,7 +17,7 @@ import numpy.typing as npt
 from hvt_common.camera_motion import Affine
 from hvt_common.inference.class_names import group_of
 from hvt_common.values import Tracks
-from hvt_ground.events import Event, Refinement
+from hvt_ground.events import Refinement
 
 _LIKELY, _LIKELY_ODD = 0.5, 0.65
 """From this mean confidence on it is more likely right than not; a person, one much larger than others or on one."""
@@ -97,12 +97,10 @@ class Guesses:
         """(N,) True for those that were guesses in the newest list."""
         return np.array([one in self._ids for one in ids.tolist()], np.bool_)
 
-    def doubting(self, event: Event, *, sure: float) -> Event:
-        """What a still says, doubted where it is not so ``sure`` and its track is a guess, or it has none."""
-        if not isinstance(event, Refinement) or event.unread or event.confidence > sure:
-            return event
-        guess = event.track_id is None or bool(self.among(np.array([event.track_id]))[0])
-        return replace(event, doubted=event.doubted or guess)
+    def doubting(self, still: Refinement) -> Refinement:
+        """What a still says that is not sure, doubted where its track is a guess, or it has none."""
+        guess = still.track_id is None or bool(self.among(np.array([still.track_id]))[0])
+        return replace(still, doubted=still.doubted or guess)
 
     def agreed(
         self, ids: npt.NDArray[np.int64], names: Sequence[str], *, aslant: bool | None

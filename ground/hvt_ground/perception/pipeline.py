@@ -20,7 +20,7 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Detections, Image, Tracks, View
 from hvt_common.video.hevc import Picture, YuvPicture
-from hvt_ground.events import Event, Overlay
+from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
 from hvt_ground.perception.guesses import Guesses
@@ -28,7 +28,7 @@ from hvt_ground.perception.history import History, as_bgr
 from hvt_ground.perception.models import Detection, DetectorThread
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.stills.posterior import SURE
+from hvt_ground.perception.stills.posterior import LEAST_SURE_PX, SURE
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
@@ -142,7 +142,7 @@ class Pipeline:
     ) -> None:
         self._parts = parts
         self._detect_every, self._detect_still_every = detect_every, detect_still_every
-        self._base_size = view.base_size
+        self._base_size, self._scale = view.base_size, view.scale
         self._frame_ns = SECOND_NS / fps
         self._turn_s = _TURN_SHARE / fps
         self._detection: Detection | None = None
@@ -417,7 +417,10 @@ class Pipeline:
         pending, guesses = self._pending, self._parts.guesses
         while pending:
             event = pending.pop(0)
-            self._emit(event if guesses is None else guesses.doubting(event, sure=SURE))
+            if guesses is not None and isinstance(event, Refinement) and not event.unread:
+                firm = self._are_firm(np.array([event.box_base_px]), np.array([event.confidence]))
+                event = event if firm[0] else guesses.doubting(event)
+            self._emit(event)
 
     def _doubting(self, shown: Overlay) -> Overlay:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the
@@ -425,12 +428,20 @@ class Pipeline:
         guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
         doubted = shown.doubted
         if guesses is not None:
-            doubted = doubted | guesses.among(shown.track_ids) & ~(shown.refined & (shown.confidences > SURE))
+            firm = shown.refined & self._are_firm(shown.boxes_base_px, shown.confidences)
+            doubted = doubted | guesses.among(shown.track_ids) & ~firm
             vague = vague & ~guesses.agreed(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
         if self.trust.unlike:
             doubted = doubted | np.array([one == "base" for one in shown.origins], np.bool_) & ~shown.refined
             sure = np.zeros_like(sure)
         return replace(shown, doubted=doubted, sure=sure, vague=vague)
+
+    def _are_firm(
+        self, boxes_base_px: npt.NDArray[np.floating], confidences: npt.NDArray[np.floating]
+    ) -> npt.NDArray[np.bool_]:
+        # Whether stills know them, however weak they are on the base.
+        sides = (boxes_base_px[:, 2:] - boxes_base_px[:, :2]).min(axis=1, initial=np.inf)
+        return np.asarray((confidences > SURE) & (sides >= LEAST_SURE_PX * self._scale))
 
     def _inside(self, shown: Overlay) -> Overlay:
         # The tracker lets boxes leave the picture.

@@ -18,6 +18,7 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
+from hvt_ground.perception import pipeline
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import as_bgr
 from hvt_ground.perception.models import DetectorThread
@@ -322,9 +323,14 @@ def test_a_kind_that_detections_do_not_agree_on_is_not_named(pictures):
     assert said == [{"car"}, {"vehicle"}]
 
 
-@pytest.mark.parametrize(("confidence", "doubted"), [(0.7, True), (0.95, False)])
-def test_a_guess_stays_one_until_a_still_is_sure_of_it(flight, pictures, confidence, doubted):
-    """Stills made firm pedestrians of lane marks, by .6."""
+@pytest.mark.parametrize(
+    ("confidence", "least_px", "doubted"), [(0.7, 12, True), (0.95, 12, False), (0.95, 1000, True)]
+)
+def test_a_guess_stays_one_until_a_still_is_sure_of_it(
+    flight, pictures, monkeypatch, confidence, least_px, doubted
+):
+    """Stills made firm pedestrians of lane marks, by .6, and of a shrub of nine pixels by .99."""
+    monkeypatch.setattr(pipeline, "LEAST_SURE_PX", least_px)
 
     class Doubts(Guesses):
         def among(self, ids):
