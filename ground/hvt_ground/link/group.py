@@ -32,6 +32,8 @@ _JOIN_S = 1.5
 """After its start a member claims nothing for so long: it learns who is there."""
 _SETTLE_S = 0.3
 """Between a claim and serving: another claim of the same moment is seen by then."""
+_PASS_S = 10.0
+"""A member that has not claimed its edge for so long does not accept it: the others share it without that one."""
 _MOST_PAGE_BYTES = 512
 _ANSWER_S = 5.0
 _MOST_MEMBERS, _MOST_EDGES, _MOST_CLAIMS = 1024, 16384, 64
@@ -91,6 +93,10 @@ class GroundGroup:
         """By edge, the other members that claim it."""
         self._mine: dict[str, bool] = {}
         """Whether each edge is this member's; until members or claims change."""
+        self._unclaimed_s: dict[str, float] = {}
+        """The time since which nobody has claimed an edge that is another member's."""
+        self._passed: set[str] = set()
+        """Edges that their member does not claim."""
         self._own: dict[str, tuple[float, zenoh.LivelinessToken]] = {}
         """The time since which each edge is claimed here."""
         self._serving: set[str] = set()
@@ -125,9 +131,15 @@ class GroundGroup:
 
     def serves(self, edge: str) -> bool:
         """Whether the edge is to be served here now; claims it where it is this member's."""
-        with self._lock:
-            mine, claimed_elsewhere = self._is_mine(edge), edge in self._claims
         now_s = self._clock()
+        with self._lock:
+            claimed_elsewhere = edge in self._claims
+            if claimed_elsewhere or self._is_mine(edge):
+                self._unclaimed_s.pop(edge, None)
+            elif now_s - self._unclaimed_s.setdefault(edge, now_s) >= _PASS_S:
+                self._passed.add(edge)
+                del self._mine[edge]
+            mine = self._is_mine(edge)
         if not mine or now_s - self._began_s < _JOIN_S:
             self._serving.discard(edge)
             return False
@@ -136,8 +148,17 @@ class GroundGroup:
                 now_s,
                 self._session.liveliness().declare_token(self._keys.claim(self.member, edge)),
             )
-        if not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S:
+        settled = not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S
+        if settled and edge not in self._serving:
             self._serving.add(edge)
+            if edge in self._passed and self._lines.take(round(now_s * SECOND_NS)):
+                owner = owner_of(edge, self.members)
+                _log.warning(
+                    "%s: %s does not claim %s (other --edges or keys?): it is served here",
+                    self.name,
+                    owner,
+                    edge,
+                )
         # Once it is served, the claim of a member that is about to give way interrupts nothing.
         return edge in self._serving
 
@@ -156,6 +177,7 @@ class GroundGroup:
         with self._lock:
             for edge in self._mine.keys() - known:
                 del self._mine[edge]
+                self._unclaimed_s.pop(edge, None)
 
     def __enter__(self) -> Self:
         return self
@@ -170,8 +192,8 @@ class GroundGroup:
     def _is_mine(self, edge: str) -> bool:
         # Under the lock. Who claims takes part, also where its own token has not come yet.
         if edge not in self._mine:
-            members = self._members | self._claims.get(edge, set())
-            self._mine[edge] = owner_of(edge, members) == self.member
+            others = {self.member} if edge in self._passed else self._members
+            self._mine[edge] = owner_of(edge, others | self._claims.get(edge, set())) == self.member
         return self._mine[edge]
 
     def _request_page(self, member: str) -> None:
@@ -193,6 +215,7 @@ class GroundGroup:
 
     def _withdraw(self, edge: str) -> None:
         self._serving.discard(edge)
+        self._passed.discard(edge)
         claim = self._own.pop(edge, None)
         if claim is not None:
             claim[1].undeclare()  # type: ignore[no-untyped-call]

@@ -95,6 +95,32 @@ def test_a_claim_that_has_to_give_way_interrupts_nothing(sessions):
         claim.undeclare()
 
 
+def test_an_edge_that_its_member_does_not_accept_is_served_by_another(sessions, monkeypatch, caplog):
+    """With two patterns of --edges in a group the flights of most edges were recorded and shown by nobody."""
+    edge = next(one for one in EDGES if owner_of(one, ("base-a", "base-b", "base-c")) == "base-c")
+    monkeypatch.setattr("hvt_ground.link.group._PASS_S", 0.5)
+    absent = sessions[0].liveliness().declare_token(GroupKeys("north").member("base-c"))
+    with (
+        GroundGroup(sessions[0], "north", member="base-a") as first,
+        GroundGroup(sessions[1], "north", member="base-b") as second,
+    ):
+        eventually(lambda: len(first.members) == len(second.members) == 3, what="all are known")
+        groups = sorted((first, second), key=lambda one: owner_of(edge, ("base-a", "base-b")) == one.member)
+
+        def share() -> list[bool]:
+            for one in groups:
+                if not one.serves(edge):
+                    one.release(edge)
+            return [one.serves(edge) for one in groups]
+
+        eventually(lambda: share() == [False, True], what="one of both serves it")
+        assert f"north: base-c does not claim {edge}" in caplog.text
+        claim = sessions[0].liveliness().declare_token(GroupKeys("north").claim("base-c", edge))
+        eventually(lambda: share() == [False, False], what="it gives way to its member")
+        claim.undeclare()
+    absent.undeclare()
+
+
 def test_a_page_is_asked_for_until_it_is_known(sessions):
     """Its tile would lead nowhere for as long as both run."""
     keys = GroupKeys("north")
