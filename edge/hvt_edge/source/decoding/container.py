@@ -33,6 +33,8 @@ _THREAD_PX, _THREAD_FPS = 1280 * 720, 30
 """What one thread decodes beside all else that it does: 9 ms a picture of H.264 at 8 Mbit/s."""
 _NO_STAMPS = 0x80
 """``AVFMT_NOTIMESTAMPS`` of libavformat: a raw stream, whose times FFmpeg invents at 25 frames a second."""
+_PICTURES_IN_A_ROW = "_pipe"
+"""How the names of such formats end (``jpeg_pipe``), whose times FFmpeg invents too."""
 _MAY_JUMP = 0x200
 """``AVFMT_TS_DISCONT``: a container whose stamps may jump by what it is."""
 _MOST_FPS = 240
@@ -159,7 +161,8 @@ def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: Non
 
 
 def without_stamps(stream: Any) -> bool:
-    return bool(stream.container.format.flags & _NO_STAMPS)
+    container = stream.container.format
+    return bool(container.flags & _NO_STAMPS) or container.name.endswith(_PICTURES_IN_A_ROW)
 
 
 def said_rate(stream: Any) -> Fraction | None:

@@ -90,6 +90,15 @@ def test_a_raw_stream_that_says_an_impossible_rate_is_guessed_at(tmp_path):
     assert "25 frames a second, which is a guess" in " ".join(source.notes)
 
 
+def test_the_rate_of_jpegs_in_a_row_is_a_guess(tmp_path):
+    """A recording of 30 frames a second, as a camera writes it, lasted longer, without a word."""
+    film = b"".join(cv2.imencode(".jpg", numbered(number))[1].tobytes() for number in range(9))
+    (tmp_path / "a.mjpeg").write_bytes(film)
+    source, pictures = play(tmp_path / "a.mjpeg", fps=25.0)
+    assert numbers(pictures) == list(range(9))
+    assert "25 frames a second, which is a guess" in " ".join(source.notes)
+
+
 def test_pictures_that_a_decoder_patched_are_counted(tmp_path, caplog):
     """A link that loses packets would show squares, and nobody be told where they come from."""
     clip = write_numbered(tmp_path / "a.ts", 60, bf="0", g="60", preset="ultrafast")
