@@ -69,7 +69,7 @@ class Elsewhere:
 class GroundGroup:
     """This ground as a ``member`` of a group, with a ``page`` or none; a context manager.
 
-    For one thread, beside Zenoh's callbacks.
+    ``pass_s`` is how long an edge waits for its own member to claim it. For one thread, beside Zenoh's callbacks.
     """
 
     def __init__(
@@ -80,11 +80,13 @@ class GroundGroup:
         member: str | None = None,
         page: str = "",
         clock: Callable[[], float] = time.monotonic,
+        pass_s: float = _PASS_S,
     ) -> None:
         self.name, self.member = name, member or member_name()
         self._keys = GroupKeys(name)
         self._session = session
         self._clock = clock
+        self._pass_s = pass_s
         self._began_s = clock()
         self._lock = threading.Lock()
         self._lines = TokenBucket(burst=_BURST, every_ns=_EVERY_NS)
@@ -136,7 +138,7 @@ class GroundGroup:
             claimed_elsewhere = edge in self._claims
             if claimed_elsewhere or self._is_mine(edge):
                 self._unclaimed_s.pop(edge, None)
-            elif now_s - self._unclaimed_s.setdefault(edge, now_s) >= _PASS_S:
+            elif now_s - self._unclaimed_s.setdefault(edge, now_s) >= self._pass_s:
                 self._passed.add(edge)
                 del self._mine[edge]
             mine = self._is_mine(edge)
@@ -148,8 +150,8 @@ class GroundGroup:
                 now_s,
                 self._session.liveliness().declare_token(self._keys.claim(self.member, edge)),
             )
-        settled = not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S
-        if settled and edge not in self._serving:
+        waited = not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S
+        if waited and edge not in self._serving:
             self._serving.add(edge)
             if edge in self._passed and self._lines.take(round(now_s * SECOND_NS)):
                 owner = owner_of(edge, self.members)

@@ -95,14 +95,13 @@ def test_a_claim_that_has_to_give_way_interrupts_nothing(sessions):
         claim.undeclare()
 
 
-def test_an_edge_that_its_member_does_not_accept_is_served_by_another(sessions, monkeypatch, caplog):
+def test_an_edge_that_its_member_does_not_accept_is_served_by_another(sessions, caplog):
     """With two patterns of --edges in a group the flights of most edges were recorded and shown by nobody."""
     edge = next(one for one in EDGES if owner_of(one, ("base-a", "base-b", "base-c")) == "base-c")
-    monkeypatch.setattr("hvt_ground.link.group._PASS_S", 0.5)
     absent = sessions[0].liveliness().declare_token(GroupKeys("north").member("base-c"))
     with (
-        GroundGroup(sessions[0], "north", member="base-a") as first,
-        GroundGroup(sessions[1], "north", member="base-b") as second,
+        GroundGroup(sessions[0], "north", member="base-a", pass_s=0.5) as first,
+        GroundGroup(sessions[1], "north", member="base-b", pass_s=0.5) as second,
     ):
         eventually(lambda: len(first.members) == len(second.members) == 3, what="all are known")
         groups = sorted((first, second), key=lambda one: owner_of(edge, ("base-a", "base-b")) == one.member)
