@@ -440,8 +440,8 @@ def check(config: EdgeConfig) -> EdgeConfig:
         )
     if config.min_budget is not None and config.min_budget > config.budget_bps:
         raise UserError(
-            f"--min-budget {bitrate_text(config.min_budget)} is more than --budget "
-            f"{bitrate_text(config.budget_bps)}: give less, or the same for a rate that does not change"
+            f"--min-budget {config.min_budget / 1000:g} kbps is more than --budget "
+            f"{config.budget_bps / 1000:g} kbps: give less, or the same for a rate that does not change"
         )
     if config.store and config.store < _LEAST_STORE_BYTES:
         raise UserError(
@@ -475,7 +475,7 @@ def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
     if config.budget_bps < least_bps:
         by_share = least_bps > least_budget_bps(config, size, share=1.0)
         raise UserError(
-            f"--budget {bitrate_text(config.budget_bps)} is too little for {stream_text(config, size)}: give at "
+            f"--budget {config.budget_bps / 1000:g} kbps is too little for {stream_text(config, size)}: give at "
             f"least {bitrate_text(least_bps)}, lower --size or --fps"
             f"{f', or raise --video-share {config.share:g}' if by_share else ''}"
         )

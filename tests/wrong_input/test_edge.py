@@ -97,6 +97,7 @@ def test_a_value_that_is_not_accepted(edge, flag, value, accepted):
     [
         ("--video-share 0", ["--video-share 0 leaves no base stream"]),
         ("--size 1280x720 --budget 10kbps", ["--budget 10 kbps", "at least", "--size"]),
+        ("--size 1280x720 --budget 300", ["--budget 0.3 kbps is too little"]),
         *(
             (f"--encoder hevc_nvenc {regions}", ["--roi-depth 0.1 needs x265", "--encoder hevc_nvenc"])
             for regions in ("--roi-depth 0.1", "--method R0")
