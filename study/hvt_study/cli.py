@@ -31,6 +31,14 @@ _PROGRAM = "hvt-study"
 _INTERRUPTED = 130
 
 
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Says a default once, and none where there is none."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        none = action.default in (None, "", []) or "(default" in (action.help or "")
+        return action.help if none else super()._get_help_string(action)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``hvt-study``; 0, or 2 after one sentence on stderr where the user can mend something.
 
@@ -57,7 +65,7 @@ def _run(argv: Sequence[str] | None) -> int:
                 name,
                 help=summary,
                 description=summary,
-                formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+                formatter_class=_Help,
             )
             if name in words[:1]:
                 command = import_module(f"hvt_study.commands.{name}")

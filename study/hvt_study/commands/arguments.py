@@ -48,7 +48,11 @@ _USUAL: Mapping[str, dict[str, Any]] = {
         "comparison with its tables",
     },
     "--cache": {"type": Path, "metavar": "DIR", "help": "finished flights (default: DIR/cache)"},
-    "--classes": {"default": "", "metavar": "NAME,…", "help": "of YOLO labels without classes.txt"},
+    "--classes": {
+        "default": "",
+        "metavar": "NAME,…",
+        "help": "class names of YOLO labels without classes.txt",
+    },
     "--classifier": {
         "action": "append",
         "help": "reads the stills: detector, none, FILE.onnx or a model's name; may be given several times "
@@ -63,53 +67,56 @@ _USUAL: Mapping[str, dict[str, Any]] = {
         "type": int,
         "default": 5,
         "metavar": "N",
-        "help": "frames from one detection to the next at edge and ground; DDS looks at every frame that it codes, "
-        "and with 1 so does the rest",
+        "help": "detect on every n-th frame, at edge and ground; DDS detects on every frame that it codes",
     },
     "--detector": {"metavar": "FILE"},
-    "--edge-detector": {"metavar": "FILE", "help": "of the edge (default: the ground's)"},
+    "--edge-detector": {"metavar": "FILE", "help": "detector of the edge (default: the ground's)"},
     "--jobs": {
         "type": int,
         "metavar": "N",
-        "help": "processes, each with one thread and one sequence's pictures at a time (default: the cores)",
+        "help": "processes at a time, each with one thread and the pictures of one sequence (default: the cores)",
     },
     "--labelled": {
         "default": "",
         "metavar": "KIND,…",
-        "help": "kinds that the labels know, such as vehicle; others count neither way (default: all they name)",
+        "help": "kinds that are labelled, such as vehicle; others are not judged (default: all that are named)",
     },
     "--labels": {
         "default": "annotations",
         "choices": ("annotations", "reference"),
-        "help": "what is there: the dataset's word, or the ground's detector on untouched frames",
+        "help": "what counts as true: the dataset's annotations, or the ground's detector on the untouched frames",
     },
-    "--limit": {"type": int, "metavar": "N", "help": "sequences of a dataset"},
+    "--limit": {"type": int, "metavar": "N", "help": "at most so many sequences of each dataset"},
     "--matched-to": {
         "metavar": "NAME,…",
         "help": "methods at whose totals video is coded again (default: each of --methods that is not video)",
     },
-    "--max-frames": {"type": int, "metavar": "N", "help": "frames of the clip, 15 a second"},
-    "--methods": {"metavar": "NAME,…", "help": "which to fly"},
+    "--max-frames": {"type": int, "metavar": "N", "help": "at most so many frames of the clip, 15 a second"},
+    "--methods": {"metavar": "NAME,…", "help": "methods to fly"},
     "--only": {
         "action": "append",
         "default": [],
         "metavar": "NAME",
-        "help": "sequences, or patterns of them",
+        "help": "only sequences of this name or pattern; may be given several times",
     },
     "--out": {"type": Path, "required": True, "metavar": "DIR"},
     "--provider": {
         "default": "cpu",
-        "help": "what runs the networks, as of hvt-edge; auto may choose another each time",
+        "help": "runtime of the networks, as for hvt-edge; auto may choose another each time",
     },
     "--rates": {"metavar": "KBPS,…", "help": "budgets in kbps"},
-    "--refine": {"default": "fuse", "choices": ("replace", "fuse"), "help": "as of hvt-ground"},
+    "--refine": {
+        "default": "fuse",
+        "choices": ("replace", "fuse"),
+        "help": "how stills change a class, as for hvt-ground",
+    },
     "--regimes": {
         "default": "low,moderate",
         "metavar": "NAME,…",
-        "help": "low, moderate, or budgets such as 300kbps",
+        "help": "budgets: low (800kbps), moderate (1400kbps), or such as 300kbps",
     },
     "--size": {"default": "1280x720", "metavar": "WxH", "help": "size of the base stream"},
-    "--still-codecs": {"default": "jpeg", "metavar": "NAME,…", "help": "for the methods with stills"},
+    "--still-codecs": {"default": "jpeg", "metavar": "NAME,…", "help": "codecs of the methods with stills"},
     "--tune": {
         "action": "append",
         "default": [],
@@ -133,7 +140,7 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
     """All that decides which runs there are; ``methods`` where several may be named, ``writes`` with ``--out``."""
     parser.add_argument("datasets", nargs="+", metavar="DATASET", help=", ".join(DATASETS))
     several = (
-        "of the ground, and of reference labels: FILE.onnx or a model's name; may be given several times "
+        "detector of the ground, and of reference labels: FILE.onnx or a model's name; may be given several times "
         "(default: the embedded one)"
     )
     option(parser, "--detector", action="append", help=several)
@@ -148,7 +155,7 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
         parser.set_defaults(methods=every, tune=[])
     for name in ("--regimes", "--still-codecs", "--labels", "--detect-every", "--size"):
         option(parser, name)
-    option(parser, "--max-frames", help="frames of a sequence")
+    option(parser, "--max-frames", help="at most so many frames of each sequence, 15 a second")
     for name in ("--limit", "--only", "--provider"):
         option(parser, name)
     written = "results.parquet, report.html, …" if writes else "not needed: nothing is written"

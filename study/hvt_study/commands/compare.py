@@ -59,7 +59,7 @@ _LEGEND = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Clip, models, rates, methods, and where the results go."""
     parser.add_argument("clip", metavar="CLIP", help=_CLIPS)
-    help_text = "of the ground and of the reference labels: FILE.onnx or a model's name"
+    help_text = "detector of the ground and of reference labels: FILE.onnx or a model's name"
     option(parser, "--detector", required=True, help=help_text)
     option(parser, "--edge-detector")
     option(parser, "--rates", default="150,200,300,400,800")
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--labels",
         default="auto",
         choices=("auto", "exact", "reference"),
-        help="exact where the source knows them, or what the detector says of untouched frames",
+        help="what counts as true: exact labels of the source, or reference: the detector on untouched frames",
     )
     option(parser, "--classes")
     option(parser, "--labelled")

@@ -74,14 +74,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--data", **several, required=True, help=data)
     apart = "pictures to measure on in place of the last fifth of --data"
     option(parser, "--held-out", **several, default=[], help=apart)
-    parser.add_argument("--start", default=EMBEDDED_DETECTOR, metavar="NAME|FILE", help="where to begin")
+    parser.add_argument(
+        "--start", default=EMBEDDED_DETECTOR, metavar="NAME|FILE", help="network to begin with"
+    )
     option(parser, "--out", metavar="FILE.onnx")
     option(parser, "--classes")
-    option(parser, "--size", help="of the base stream: pictures are fitted into it")
-    parser.add_argument("--minutes", type=float, default=45.0, help="end the training by then")
+    option(parser, "--size", help="size of the base stream: pictures are fitted into it")
+    parser.add_argument("--minutes", type=float, default=45.0, help="end the training after so many minutes")
     parser.add_argument("--steps", type=int, default=1500, help="most steps, of 8 views each")
-    parser.add_argument("--seed", type=int, default=1, help="of everything that is random")
-    parser.add_argument("--threads", type=int, default=2, help="of PyTorch")
+    parser.add_argument("--seed", type=int, default=1, help="seed of everything that is random")
+    parser.add_argument("--threads", type=int, default=2, help="threads of PyTorch")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -191,14 +191,18 @@ _HIGHEST_SEED = 2**32 - 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plan_arguments(parser, methods=False)
     add_pool_arguments(parser)
-    parser.add_argument("--method", required=True, help="the one to tune, such as M5")
+    parser.add_argument("--method", required=True, help="method to tune, such as M5")
     add = parser.add_argument
     add("--parameters", default="", metavar="NAME,…", help="which of its parameters (default: all)")
-    add("--trials", type=int, default=40, metavar="N", help="proposals that are flown")
+    add("--trials", type=int, default=40, metavar="N", help="sets of parameters to try")
     add(
-        "--held-out", type=float, default=0.34, metavar="SHARE", help="of the sequences, for the report alone"
+        "--held-out",
+        type=float,
+        default=0.34,
+        metavar="SHARE",
+        help="share of sequences for the report alone",
     )
-    add("--seed", type=int, default=0, help="of the search")
+    add("--seed", type=int, default=0, help="seed of the search")
 
 
 def run(arguments: argparse.Namespace) -> int:

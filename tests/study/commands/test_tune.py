@@ -86,6 +86,17 @@ def test_of_one_target_recall_is_searched_for():
     assert (found["train_default"], found["held_out_gain"]) == (0.5, pytest.approx(0.1))
 
 
+def test_the_help_says_a_default_once_and_none_where_there_is_none(capsys):
+    """A user would read "(default: all) (default: )", and "(default: [])" of a list."""
+    with pytest.raises(SystemExit):
+        main(["tune", "--help"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "(default: all)" in out
+    assert "(default: 40)" in out
+    for empty in ("(default: )", "(default: None)", "(default: [])"):
+        assert empty not in out
+
+
 def test_what_cannot_be_tuned_is_told(scene, tmp_path, capsys):
     """Hours of flights that all are the same."""
     for words, wanted in (
