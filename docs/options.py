@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from hvt_common.config import default_words
 from hvt_edge.config import EdgeConfig
 from hvt_ground.extras import config_class
 
@@ -31,7 +32,8 @@ Every option is a flag, or in a TOML file a key without the dashes (`--config FI
 | list | the flag may be repeated; in TOML `["…", "…"]` |
 | yes/no | `--name`, `--no-name`; in TOML `true` or `false` |
 
-The default stands in brackets. `hvt-edge --help` leaves out options with a star; `--help-all` lists everything.
+The default stands in brackets, that of `--profile auto` first.
+`hvt-edge --help` leaves out options with a star; `--help-all` lists everything.
 A wrong value ends the program before the first frame with one sentence and exit code 2.
 """
 
@@ -50,28 +52,22 @@ def _program(name: str, config: type) -> Iterator[str]:
     for group, fields in groups.items():
         if group:
             yield f"### {group[0].upper()}{group[1:]}\n"
-        yield from map(_row, fields)
+        yield from (_row(field, config) for field in fields)
         yield ""
 
 
-def _row(field: dataclasses.Field[Any]) -> str:
+def _row(field: dataclasses.Field[Any], config: type) -> str:
     key, star = field.name.replace("_", "-"), "*" if field.metadata.get("rare") else ""
+    default = default_words(config, field).replace("<", "&lt;")
+    if default and " " not in default:
+        default = f"`{default}`"
     if field.metadata.get("switch"):
-        named, default = f"`--{key}`, `--no-{key}`{star}", "yes" if field.default else "no"
+        named = f"`--{key}`, `--no-{key}`{star}"
     else:
         named = (
             f"`--{key} {field.metadata['kind'].metavar}`{star}{', list' if field.metadata['many'] else ''}"
         )
-        default = _default(field)
     return f"- {named}{f' ({default})' if default else ''}: {field.metadata['help']}"
-
-
-def _default(field: dataclasses.Field[Any]) -> str:
-    if shown := field.metadata["shown_default"]:
-        return str(shown).replace("<", "&lt;")
-    if field.default is None or field.default == ():
-        return ""
-    return f"`{field.metadata['kind'].show(field.default)}`"
 
 
 if __name__ == "__main__":

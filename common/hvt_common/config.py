@@ -4,6 +4,7 @@ A field is declared by its `Group`: its kind (how text becomes a value and back)
 Every value passes through its kind whether it comes from the file or from the command line, so both say the
 same sentence when it is wrong. ``--help`` leaves out what is ``rare``; ``--help-all`` lists everything. A class
 may name in ``GONE`` what it does not take (any more): name → the end of the sentence, with what to do in its place.
+``USUAL`` of a class: name → value that a start without flags has in place of the default, and the flags that undo it.
 """
 
 from __future__ import annotations
@@ -280,16 +281,16 @@ def _flags(config_class: type, *, program: str, description: str, rare: bool) ->
         into = groups.get(field.metadata["group"], parser)
         help_line = field.metadata["help"].replace("%", "%%")
         hidden = field.metadata["rare"] and not rare
+        shown = default_words(config_class, field).replace("%", "%%")
+        shown_help = f"{help_line} [{shown}]" if shown else help_line
         if field.metadata.get("switch"):
             into.add_argument(
                 _flag(field),
                 action=argparse.BooleanOptionalAction,
-                help=argparse.SUPPRESS if hidden else help_line,
+                help=argparse.SUPPRESS if hidden else shown_help,
             )
             continue
         kind: SettingType = field.metadata["kind"]
-        shown = field.metadata["shown_default"] or _shown(kind, field.default)
-        shown_help = f"{help_line} [{shown}]" if shown else help_line
         bare = field.metadata["bare"]
         into.add_argument(
             _flag(field),
@@ -302,12 +303,23 @@ def _flags(config_class: type, *, program: str, description: str, rare: bool) ->
     return parser
 
 
-def _shown(kind: SettingType, default: object) -> str:
+def default_words(config_class: type, field: dataclasses.Field[Any]) -> str:
+    """A setting's default as ``--help`` says it: of two, that of a start without flags comes first."""
+    both: tuple[Mapping[str, Any], str] = getattr(config_class, "USUAL", ({}, ""))
+    usual, unless = both
+    own = field.metadata.get("shown_default") or _shown(field, field.default)
+    return f"{_shown(field, usual[field.name])}; {own} {unless}" if field.name in usual else own
+
+
+def _shown(field: dataclasses.Field[Any], default: object) -> str:
     if default is None or default == ():
         return ""
+    if field.metadata.get("switch"):
+        return "yes" if default else "no"
+    kind: SettingType = field.metadata["kind"]
     if isinstance(default, tuple) and kind.metavar != SIZE.metavar and not kind.metavar.startswith("WxH"):
         return " ".join(str(kind.show(item)) for item in default)
-    return str(kind.show(default)).replace("%", "%%")
+    return str(kind.show(default))
 
 
 def _value(field: dataclasses.Field[Any], given: Any, *, name: str) -> Any:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from hvt_common.config import (
     AUTO,
@@ -77,6 +77,8 @@ _SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (
 class EdgeConfig:
     """The settings of ``hvt-edge``. See ``--help-all`` for each."""
 
+    USUAL: ClassVar = (PROFILES[AUTO], "with --method/--regime")
+
     source: str | None = _SOURCE.option(
         PLACE, None, "clip.mp4, folder/, rtsp://…, /dev/video0, demo or demo:codes,4k"
     )
@@ -93,13 +95,13 @@ class EdgeConfig:
         "frame rate of the base stream; auto: up to 15, fewer and better frames where the rate is thin",
     )
     fit: str = _SOURCE_RARE.option(
-        choice("letterbox", "crop"), "letterbox", "how another aspect ratio is fitted"
+        choice("letterbox", "crop"), "letterbox", "another aspect ratio: with black bars, or with cut edges"
     )
     source_fps: float | None = _SOURCE_RARE.option(
-        number(0.1, 1000), None, "frame rate of an image folder, or in place of a file's own"
+        number(0.1, 1000), None, "frame rate of an image folder; of a video, in place of its time stamps"
     )
     follow: bool = _SOURCE_RARE.switch(
-        "wait for a video file that still grows; it ends when it has not for 10 s"
+        "wait for a video file that is still written; ends after 10 s without more"
     )
     pose: str | None = _SOURCE.option(
         PLACE,
@@ -107,12 +109,12 @@ class EdgeConfig:
         "where the camera is: FILE.csv, .srt (DJI), .gpx, fixed:LAT,LON,HEIGHT,AZIMUTH,TILT or mavlink:…",
     )
     fov: float | None = _SOURCE_RARE.option(
-        number(1, 179, unit=" degrees"), None, "horizontal field of view, where --pose does not say it"
+        number(1, 179, unit=" degrees"), None, "horizontal field of view in degrees, where --pose has none"
     )
     seed: int = _SOURCE_RARE.option(integer(0, 2**31 - 1), 0, "seed of the demo scene")
     max_frames: int | None = _SOURCE_RARE.option(integer(1, 10**9), None, "end after this many base frames")
     pace: str = _SOURCE_RARE.option(
-        choice("realtime", "lockstep"), "realtime", "play at the clip's speed, or as fast as all parts allow"
+        choice("realtime", "lockstep"), "realtime", "at the clip's speed, or as fast as both sides allow"
     )
 
     budget: int | None = _LINK.option(
@@ -122,7 +124,7 @@ class EdgeConfig:
         or_auto(SHARE),
         None,
         "share of the budget for the base stream; auto follows the scene",
-        shown_default="0.8125; 1 for M0",
+        shown_default="0.8125 (1 for M0)",
     )
     regime: str | None = _LINK_RARE.option(
         choice(*REGIMES), None, "a budget of the paper: low 0.80 Mbps, moderate 1.40 Mbps"
@@ -143,7 +145,7 @@ class EdgeConfig:
     )
     listen: tuple[str, ...] = _LINK.option(TEXT, (), "Zenoh endpoint to listen on", many=True)
     zenoh_config: Path | None = _LINK.option(
-        PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
+        PATH, None, "JSON5 file of Zenoh settings: it overrides HVT's own, --listen and --connect override it"
     )
     links: int = _LINK_RARE.option(
         integer(1, 2), 1, "2: one Zenoh link for urgent messages and one for the rest (docs/adaptation.md)"
@@ -154,8 +156,7 @@ class EdgeConfig:
     method: str = _SENT.option(
         choice(*METHODS, elsewhere=dict.fromkeys(PROFILES, "--profile")),
         "M5",
-        "who gets a still, and when",
-        shown_default="as --profile says; M5 with --regime",
+        "which tracks get a still, and when (docs/methods.md)",
     )
     profile: str | None = _SENT.option(
         choice(*PROFILES),
@@ -174,13 +175,13 @@ class EdgeConfig:
         DURATION, 2.0, "least time between two stills of a track; 0 for the paper's plain methods"
     )
     min_gain: float = _SENT_RARE.option(
-        number(1, 100), 1.2, "a track is sent again only when this much larger or sharper"
+        number(1, 100), 1.2, "within 5 x --cooldown another still only of a track this much larger or sharper"
     )
     still_codec: str = _SENT.option(
         TEXT, "jpeg", "codec of stills; residual sends the difference to the base"
     )
     fallback_codec: str = _SENT_RARE.option(
-        TEXT, "h264-intra", "how a still is coded where residual does not serve: no base, or no gain"
+        TEXT, "h264-intra", "codec of a still for which residual has no base picture, or is no smaller"
     )
     jpeg_quality: int = _SENT.option(
         integer(5, 95), 65, "quality of the stills, in percent, whatever the codec"
@@ -188,20 +189,20 @@ class EdgeConfig:
     fidelity: float = _SENT_RARE.option(
         number(0, 60, unit=" dB"),
         0.0,
-        "fewest bytes that bring a still this near to the source; 0: --jpeg-quality",
+        "luma PSNR in dB for which a still gets just enough bytes; 0: by --jpeg-quality",
     )
     gate: float = _SENT_RARE.option(
-        number(0, 60, unit=" dB"), 0.0, "no still where the base is already this good (luma PSNR); 0: no gate"
+        number(0, 60, unit=" dB"), 0.0, "no still of what video shows with this luma PSNR, in dB; 0: no gate"
     )
     padding: float = _SENT_RARE.option(number(0, 1), 0.15, "margin around a box, as a share of its sides")
     send_tracks: bool = _SENT.switch("also send the edge's own tracks, a few kbps, as part of --budget")
     roi_depth: float = _SENT_RARE.option(
-        number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
+        number(0, 1), 0.0, "finer quantiser where tracks are: 0.1 is 5 of 51 steps, as for R0; 0: off"
     )
     keyframe_interval: float | str = _SENT_RARE.option(
         or_auto(DURATION),
         AUTO,
-        "time between keyframes beside those that grounds ask for; 0 for none; auto: 10s, up to 60s on a thin link",
+        "time between scheduled keyframes; 0: on request only; auto: 10s, up to 60s on a thin link",
     )
     encoder: str = _SENT_RARE.option(
         TEXT,
@@ -225,8 +226,7 @@ class EdgeConfig:
     head: str | None = _MODELS_RARE.option(
         choice(*HEAD_NAMES),
         None,
-        "what the detector's outputs mean, where neither its file nor its answers tell",
-        shown_default="found",
+        "layout of the detector's outputs (docs/models.md), if HVT does not recognise it",
     )
     candidates: str = _MODELS.option(
         choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
@@ -234,14 +234,14 @@ class EdgeConfig:
     tiles: str = _MODELS_RARE.option(
         TEXT,
         "off",
-        "detect in tiles of the source too: CxR, off, auto, which finds the scale in real time, or search, which "
-        "always does; needs --candidates source",
+        "also detect in tiles of the source: COLUMNSxROWS such as 2x2, off, or auto, which in real time searches "
+        "other scales too; search: in lockstep as well; needs --candidates source",
     )
     detect_every: int | None = _MODELS_RARE.option(
         integer(1, 1000, unit=" frames"),
         None,
         "detect on every n-th frame",
-        shown_default="5; with few frames a second less; up to 15 while all is as predicted",
+        shown_default="5; less at few frames a second; up to 15 while tracks move as predicted",
     )
     confidence: float | None = _MODELS.option(
         number(0.01, 1),
@@ -255,7 +255,7 @@ class EdgeConfig:
     camera_motion: str = _MODELS_RARE.option(
         choice("off", "flow"),
         "flow",
-        "how tracks go on between detections: with the picture, or at their own pace",
+        "how boxes move between detections: flow: by the picture's optical flow; off: at their last speed",
     )
     threads: int = _MODELS_RARE.option(integer(1, 64), 1, "threads of the detector")
     provider: str = _MODELS.option(
@@ -266,7 +266,7 @@ class EdgeConfig:
         BYTES, 24_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
     )
     ring_time: float = _FILES_RARE.option(
-        DURATION, 5.0, "how far back those go; where memory is short, with frames left out"
+        DURATION, 5.0, "how far back --ring goes; if it is too small, with frames left out"
     )
     store: int | None = _FILES.option(
         BYTES,
@@ -277,11 +277,11 @@ class EdgeConfig:
     store_folder: Path | None = _FILES_RARE.option(
         PATH,
         None,
-        "where that is stored; made when the link first goes down",
+        "folder of --store; made when the link first goes down",
         shown_default="~/.local/state/hvt/EDGE_ID",
     )
     store_age: float = _FILES_RARE.option(
-        DURATION, 3600.0, "older objects of earlier runs are dropped at the start"
+        DURATION, 3600.0, "video and stills of earlier runs that are older are dropped at the start"
     )
     record_base: Path | None = _FILES_RARE.option(
         PATH, None, "also keep the base stream in this Matroska file"

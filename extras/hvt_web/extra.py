@@ -27,13 +27,13 @@ class WebOptions(GroundConfig):
     web: str | None = _PAGE.option(
         TEXT,
         None,
-        f"also serve the page for browsers at HOST:PORT; alone: {_HERE}; beyond this machine it takes a token",
+        f"also serve the page for browsers at HOST:PORT, without a value {_HERE}; other machines need a token",
         bare=_HERE,
     )
     web_proxy: str | None = replace(_PAGE, rare=True).option(
         TEXT,
         None,
-        "a reverse proxy shows the page at this host; it says in X-HVT-Role who is viewer or operator",
+        "host at which a reverse proxy shows the page; the proxy sets X-HVT-Role to viewer or operator",
     )
 
 

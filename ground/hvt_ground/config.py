@@ -40,7 +40,7 @@ class GroundConfig:
         TEXT, (), "Zenoh endpoint to connect to, for example tcp/HOST:7447", many=True
     )
     zenoh_config: Path | None = _LINK.option(
-        PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
+        PATH, None, "JSON5 file of Zenoh settings: it overrides HVT's own, --listen and --connect override it"
     )
     links: int = _LINK_RARE.option(
         integer(1, 2), 1, "2: where it connects, one Zenoh link for urgent messages and one for the rest"
@@ -57,7 +57,7 @@ class GroundConfig:
     patience: float | None = _LINK_RARE.option(
         DURATION,
         None,
-        "how long an edge that went without a word may stay away before its session is closed",
+        "how long an edge may be silent before its session is closed",
         shown_default="10min; 5s with --once",
     )
 
@@ -73,19 +73,18 @@ class GroundConfig:
     head: str | None = _MODELS_RARE.option(
         choice(*HEAD_NAMES),
         None,
-        "what the detector's outputs mean, where neither its file nor its answers tell",
-        shown_default="found",
+        "layout of the detector's outputs (docs/models.md), if HVT does not recognise it",
     )
     tiles: str = _MODELS_RARE.option(
         choice("auto", "search", "off"),
         "auto",
-        "search: look at quarters of the picture enlarged where they promise far more objects; auto: not in lockstep",
+        "search: also detect on enlarged quarters where these show far more objects; auto: the same, not in lockstep",
     )
     detect_every: int | None = _MODELS.option(
         integer(1, 1000, unit=" frames"),
         None,
-        "detect on every n-th frame, less when behind",
-        shown_default="5; with few frames a second less; up to 15 while all is as predicted",
+        "detect on every n-th frame, more seldom when behind",
+        shown_default="5; less at few frames a second; up to 15 while tracks move as predicted",
     )
     confidence: float | None = _MODELS.option(
         number(0.01, 1),
@@ -99,12 +98,12 @@ class GroundConfig:
     camera_motion: str = _MODELS_RARE.option(
         choice("off", "flow"),
         "flow",
-        "how tracks go on between detections: with the picture, or at their own pace",
+        "how boxes move between detections: flow: by the picture's optical flow; off: at their last speed",
     )
     classifier: str | None = _MODELS.option(
         TEXT,
         None,
-        "FILE.onnx, a name of hvt-models list, none, or detector: it runs again with the stills pasted in",
+        "reads stills: FILE.onnx, a name of hvt-models list, none, or detector, again with the stills pasted in",
         shown_default="aerial-cls; detector where --detector is without aerial-nano",
     )
     refine: str = _MODELS.option(
@@ -121,7 +120,7 @@ class GroundConfig:
         PATH, None, "FILE.rrd, or a folder for one file an edge", shown_default="hvt-<edge>-<time>.rrd here"
     )
     split: Limit | None = _FILES.option(
-        _LIMIT, None, "begin a new file of the recording after so much, at the next keyframe"
+        _LIMIT, None, "begin a new file of the recording after this time or size, at the next keyframe"
     )
     tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"

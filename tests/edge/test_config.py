@@ -165,7 +165,8 @@ def test_every_flag_explains_itself(capsys):
         assert shown or optional, f"{flag} does not say its default"
     assert "[800kbps]" in out
     assert "[1280x720, less for a small source or a small --budget]" in out
-    assert "[15.0]" in out
+    assert "[auto; 15.0 with --method/--regime]" in out, "a start without flags flies auto"
+    assert "[yes; no with --method/--regime]" in out
 
 
 _RATE = st.integers(800_000, 10**9)  # enough for the largest size and rate below, at the least share

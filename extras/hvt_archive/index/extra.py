@@ -35,7 +35,7 @@ class IndexOptions(GroundConfig):
     keep: tuple[Limit, ...] = _STORE.option(
         _LIMIT,
         (),
-        "remove recordings of the folder of --record that are older, or the oldest beyond so many bytes",
+        "remove recordings in the folder of --record older than this, or the oldest while all exceed this size",
         many=True,
         shown_default="all are kept",
     )

@@ -52,7 +52,7 @@ class CotOptions(GroundConfig):
         many=True,
     )
     cot_types: Path | None = _GATEWAYS.option(
-        PATH, None, "with --cot: FILE.toml, which class and which edge is of which type (docs/atak.md)"
+        PATH, None, "with --cot: FILE.toml with the CoT type of each class and edge (docs/atak.md)"
     )
 
 
