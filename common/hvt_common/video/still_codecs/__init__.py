@@ -1,6 +1,7 @@
 """Still codecs behind one small contract (`contract.py`); docs/stills.md has the table of them.
 
-Those that no profile uses are the extra `hvt_codecs`. Who makes vectors of stills reaches into
+A new one is a file beside these and a row in `registry`, or an entry point of a package, as those of the extra
+`hvt_codecs`, which no profile uses. Who makes vectors of stills reaches into
 `h264_intra`, `h264_syntax` and `yuv420`; codecs reach into `contract`.
 """
 
