@@ -112,7 +112,7 @@ def open_detector(
     if spec == MOTION or parts[1:] or plug_in is not None:
         for word, given in (("labels file", labels), ("--head", head), ("detector size", size)):
             if given is not None:
-                raise UserError(f"{word} {given} has no say: {spec!r} is no network of one file")
+                raise UserError(f"{word} {given} has no effect: {spec!r} is no network of one file")
     if parts[1:]:
         settings = {"nms_iou": nms_iou, "threads": threads, "provider": provider}
         return _open_ensemble(parts, confidence=confidence, settings=settings)

@@ -269,10 +269,10 @@ def open_pool(arguments: argparse.Namespace) -> tuple[AbstractContextManager[Any
 
 
 def jobs_of(arguments: argparse.Namespace) -> int:
-    """How many processes on this machine; `UserError` for a number that cannot be, or has no say."""
+    """How many processes on this machine; `UserError` for a number that cannot be, or has no effect."""
     jobs: int = getattr(arguments, "jobs", os.cpu_count() or 1)
     if hasattr(arguments, "dask"):
-        raise UserError(f"--jobs {jobs} has no say with --dask: give one of them")
+        raise UserError(f"--jobs {jobs} has no effect with --dask: give one of them")
     return check_whole("--jobs", jobs, 1, _MOST_JOBS)
 
 
@@ -307,7 +307,7 @@ def _tune(arguments: argparse.Namespace) -> dict[str, tuple[str, ...]]:
     flown = {one.name for one in chosen_methods(arguments.methods)}
     for name in found:
         if name not in flown:
-            raise UserError(f"--tune of {name} has no say: it is not among --methods {arguments.methods}")
+            raise UserError(f"--tune of {name} has no effect: it is not among --methods {arguments.methods}")
     return found
 
 

@@ -187,7 +187,7 @@ def _refuse(arguments: argparse.Namespace, names: Sequence[str], what: str) -> N
     for name in names:
         if hasattr(arguments, name):
             flag = "--" + name.replace("_", "-")
-            raise UserError(f"{flag} has no say over {arguments.source}, which is {what}: leave it out")
+            raise UserError(f"{flag} has no effect on {arguments.source}, which is {what}: leave it out")
 
 
 def _own_rate(path: Path) -> float:

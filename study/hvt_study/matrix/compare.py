@@ -295,7 +295,7 @@ def _label_options(plan: ComparePlan, uri: str) -> dict[str, str]:
             kind = (
                 "a picture with YOLO labels" if name == "classes" else "a picture or a sequence with labels"
             )
-            raise UserError(f"--{name} {value} has no say over {plan.clip}: it is for {kind}")
+            raise UserError(f"--{name} {value} has no effect on {plan.clip}: it is for {kind}")
     return {name: value for name, value in given.items() if value}
 
 

@@ -120,7 +120,7 @@ def test_files_fly_together_and_settings_of_one_are_refused(tmp_path: Path) -> N
     assert default_confidence(spec) == 0.4
     assert declared_class_names(spec) is None
     assert not is_calibrated(spec, role="detector")
-    with pytest.raises(UserError, match="labels file coco has no say"):
+    with pytest.raises(UserError, match="labels file coco has no effect"):
         open_detector(spec, labels=Path("coco"))
     plus = shutil.copy(first, tmp_path / "a+b.onnx")
     assert open_detector(str(plus)).class_names == ("car", "b", "c")

@@ -116,7 +116,7 @@ def test_what_stays_open_is_refused_with_the_option_that_decides(tmp_path: Path,
     with pytest.raises(UserError, match="are not those of --head ssd"):
         open_detector(str(path), head="ssd")
     for given in ({"head": "ssd"}, {"labels": Path("names.txt")}, {"size": (640, 640)}):
-        with pytest.raises(UserError, match="has no say: 'motion' is no network of one file"):
+        with pytest.raises(UserError, match="has no effect: 'motion' is no network of one file"):
             open_detector("motion", **given)
 
 

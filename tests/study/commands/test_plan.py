@@ -109,8 +109,8 @@ def test_one_line_is_for_plan_and_run(tmp_path, capsys):
     for more, wanted in (
         (("--jobs", "0"), "--jobs 0"),
         (("--still-codecs", ","), "still codec '' is not known"),
-        (("--dask", "tcp://127.0.0.1:1"), "--jobs 3 has no say with --dask"),
-        (("--tune", "M6:again=2"), "--tune of M6 has no say: it is not among --methods M0,M5"),
+        (("--dask", "tcp://127.0.0.1:1"), "--jobs 3 has no effect with --dask"),
+        (("--tune", "M6:again=2"), "--tune of M6 has no effect: it is not among --methods M0,M5"),
         (("--matched-to", "M0"), "--matched-to 'M0' is not known: choose from M5"),
     ):
         assert main([*words, *more]) == 2

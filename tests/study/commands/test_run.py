@@ -281,7 +281,7 @@ def test_wrong_input_is_one_sentence(scene, tmp_path, capsys):
         ((scene, "--detector", str(other)), "nothing in common"),
         ((scene, "--detector", "motion"), "give a detection network"),
         ((scene, "--jobs", "0"), "--jobs 0 is not accepted"),
-        ((scene, "--jobs", "2", "--dask", "tcp://127.0.0.1:1"), "has no say with --dask"),
+        ((scene, "--jobs", "2", "--dask", "tcp://127.0.0.1:1"), "has no effect with --dask"),
         ((scene, "--regimes", "lots"), "--regimes 'lots'"),
         ((scene, "--regimes", "9kbps", "--methods", "M0", "--jobs", "1"), "every run failed"),
         ((scene, "--max-frames", "3"), "--max-frames 3 is too few"),

@@ -103,9 +103,9 @@ def test_what_has_no_say_is_refused(
     source = tmp_path / "detections.csv"
     source.write_text(DETECTIONS)
     assert main(["sweep", str(source), "--size", "640x480", *words]) == 2
-    assert f"{words[0]} has no say over {source}" in capsys.readouterr().err
+    assert f"{words[0]} has no effect on {source}" in capsys.readouterr().err
     assert main(["sweep", str(tmp_path / "a.mp4"), "--detector", "aerial-nano", "--size", "640x480"]) == 2
-    assert "--size has no say" in capsys.readouterr().err
+    assert "--size has no effect" in capsys.readouterr().err
 
 
 @pytest.mark.realdata

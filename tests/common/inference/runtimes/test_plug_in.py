@@ -107,7 +107,7 @@ def test_names_that_mean_something_else_are_refused(installed, tmp_path):
 def test_labels_have_no_say(installed, tmp_path):
     """A file of names would be taken and not used."""
     installed({"acme-blobs": "BlobDetector"}, module="acme_blobs", source=BLOBS)
-    with pytest.raises(UserError, match="has no say: 'acme-blobs' is no network of one file"):
+    with pytest.raises(UserError, match="has no effect: 'acme-blobs' is no network of one file"):
         open_detector("acme-blobs", labels=tmp_path / "names.txt")
 
 
