@@ -56,7 +56,8 @@ def _read(path: Path) -> tuple[str, list[Chunk]]:
     # The edge's id, and everything but the file's own entities; of a damaged file what can be read.
     try:
         with path.open("rb"), tempfile.TemporaryDirectory() as folder:
-            found = readable(path, Path(folder) / "readable.rrd")
+            (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone
+            found = readable(name, Path(folder) / "readable.rrd")
             if found is None:
                 raise ValueError("nothing in it can be read")  # noqa: TRY301 - in one sentence with the others
             reader = open_rrd(found)
@@ -64,7 +65,7 @@ def _read(path: Path) -> tuple[str, list[Chunk]]:
             edge = id_of(reader).edge
     except (OSError, RuntimeError, ValueError) as error:
         raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
-    if found != path:
+    if found != name:
         _log.warning("%s is damaged or breaks off: what can be read is joined", path)
     return edge, chunks
 

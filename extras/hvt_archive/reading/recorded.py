@@ -42,8 +42,8 @@ from hvt_ground.sinks.rerun.blueprint import (
     VIDEO,
 )
 from hvt_ground.sinks.rerun.map_rows import pose_of
-from hvt_ground.sinks.rerun.readable import readable
-from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd, whole_messages
+from hvt_ground.sinks.rerun.readable import has_holes, next_recording, readable
+from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId
 
 _log = logging.getLogger(__name__)
@@ -245,25 +245,22 @@ def _opened(path: Path, spool: Spool, number: int) -> _File:
     with tempfile.TemporaryDirectory() as folder:
         try:
             with path.open("rb"):
-                found = readable(path, Path(folder) / "readable.rrd")
+                (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone
+                found = readable(name, Path(folder) / "readable.rrd")
             if found is None:
                 raise ValueError("nothing in it can be read")
             file = _read(found, spool, number)
-            lost = file.drop_after_holes() if found != path and _has_holes(path, found) else 0
+            lost = file.drop_after_holes() if found != name and has_holes(path, found) else 0
         except _ODD as error:
             raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
-    if found != path:
+    if next_at := found != name and next_recording(path):
+        what = "is several recordings in one file: the first is exported; another begins after %d bytes"
+        _log.warning(f"%s {what}", path, next_at)
+    elif found != name:
         _log.warning("%s is damaged or breaks off: what can be read is exported", path)
     if lost:
         _log.warning("%s: %d pictures after a hole are left out: they need one that is lost", path, lost)
     return file
-
-
-def _has_holes(path: Path, copy: Path) -> bool:
-    # Not where it merely breaks off.
-    with path.open("rb") as file:
-        ends = [end for kind, end in whole_messages(file.fileno()) if kind]
-    return copy.stat().st_size < max(ends, default=0)
 
 
 def _read(path: Path, spool: Spool, number: int) -> _File:

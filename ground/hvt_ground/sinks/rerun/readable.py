@@ -18,6 +18,8 @@ from hvt_ground.sinks.rerun.rrd_file import STREAM_HEADER_BYTES, id_of, open_rrd
 
 _STORE_INFO = 1
 _WHOLE, _COPIED, _NOTHING = 0, 10, 11
+_FOOT_BYTES = 32
+"""Between the last message of a recording and its end."""
 _TRIES = 100
 _TRY_S, _PATIENCE_S = 60, 600.0
 
@@ -43,6 +45,22 @@ def readable(path: Path, out: Path) -> Path | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return {_WHOLE: path, _COPIED: out}.get(done.returncode)
+
+
+def has_holes(path: Path, copy: Path) -> bool:
+    """Whether the copy that `readable` made lacks messages; not where the file merely breaks off."""
+    with path.open("rb") as file:
+        ends = [end for kind, end in whole_messages(file.fileno()) if kind]
+    return copy.stat().st_size < max(ends, default=0)
+
+
+def next_recording(path: Path) -> int:
+    """After how many bytes of a file another recording begins; 0 where none does."""
+    with path.open("rb") as file:
+        head = file.read(STREAM_HEADER_BYTES)
+        end = max((end for _, end in whole_messages(file.fileno())), default=0)
+        place = os.pread(file.fileno(), STREAM_HEADER_BYTES + _FOOT_BYTES, end).find(head)
+    return end + place if end and place >= 0 else 0
 
 
 def main(path: Path, out: Path) -> int:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
+import re
 import shutil
 import struct
 import threading
@@ -34,9 +35,12 @@ from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_rec
 
 _log = logging.getLogger(__name__)
 
-STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
+STREAM_MAGIC = b"RRF2"
+STREAM_HEADER_BYTES = 12  # with version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
-_END = 0
+_END, _CHUNK, _LAST_KIND = 0, 2, 3
+_CHUNK_KIND = _CHUNK.to_bytes(8, "little")
+_BLOCK_BYTES = 2**16
 _SPARE_BYTES = 2 * 2**20
 _FLUSH_S = 10.0
 _LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
@@ -192,14 +196,35 @@ def drop_footer(path: Path) -> None:
 
 
 def whole_messages(file: int) -> Iterator[tuple[int, int]]:
-    """The kind of each message, and where it ends; up to the end of all, or one that breaks off."""
-    at, size = STREAM_HEADER_BYTES, os.fstat(file).st_size
-    while len(head := os.pread(file, _MESSAGE_HEADER.size, at)) == _MESSAGE_HEADER.size:
-        kind, length = _MESSAGE_HEADER.unpack(head)
-        at += _MESSAGE_HEADER.size + length
-        if at > size or (kind, length) == (_END, 0):
+    """The kind of each message, and where it ends, up to a footer; bytes between them that are none have its kind."""
+    at, size, kind = STREAM_HEADER_BYTES, os.fstat(file).st_size, _CHUNK
+    while kind != _END:
+        found = _message(file, at, size)
+        kind, at = found or (_CHUNK, _next_chunk(file, at, size))
+        if at < 0:
             return
-        yield kind, at
+        yield (kind if found else _END), at
+
+
+def _message(file: int, at: int, size: int) -> tuple[int, int] | None:
+    # Its kind and where it ends; None if there is none at this place, or not all of it.
+    head = os.pread(file, _MESSAGE_HEADER.size, at)
+    kind, length = _MESSAGE_HEADER.unpack(head) if len(head) == _MESSAGE_HEADER.size else (_END, 0)
+    end = at + _MESSAGE_HEADER.size + length
+    return (kind, end) if kind <= _LAST_KIND and length and end <= size else None
+
+
+def _next_chunk(file: int, at: int, size: int) -> int:
+    # Where damage ends: at a chunk that another message, or nothing, follows. -1 without one in this recording.
+    if os.pread(file, len(STREAM_MAGIC), at) == STREAM_MAGIC:
+        return -1
+    while len(block := os.pread(file, _BLOCK_BYTES, at)) >= len(_CHUNK_KIND):
+        for place in (at + one.start() for one in re.finditer(_CHUNK_KIND, block)):
+            found = _message(file, place, size)
+            if found is not None and (found[1] == size or _message(file, found[1], size)):
+                return place
+        at += len(block) - len(_CHUNK_KIND) + 1
+    return -1
 
 
 def _created(path: Path) -> int:
