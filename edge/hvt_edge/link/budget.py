@@ -68,6 +68,7 @@ _WHOLE_NS = 2 * SECOND_NS
 _PART_MARGIN = 1.03
 """So much smaller are frames of which a window holds a part more than its share: ``status`` goes beside them."""
 
+_Floats = npt.NDArray[np.float64]
 _Events = Sequence[tuple[int, int]]
 """(time, line bytes), in order of time."""
 
@@ -217,7 +218,7 @@ class RollingBudget:
         """The mean of one base frame at the rate that x265 was opened for, in line bytes."""
         self._base_peak = BASE_PEAK * max(steps, window_s * fps) * self.base_step_bytes
         self._base_steps: deque[int] = deque(maxlen=steps * _MEMORY_WINDOWS)
-        self._burst = self._recent_bursts()
+        self._note_bursts()
         self._cap = settings.still_bps * settings.carry_s / 8
 
     def set_base(self, base_bps: int, fps: float, *, now_ns: int) -> None:
@@ -272,7 +273,7 @@ class RollingBudget:
             self._last_ns = max(self._last_ns, now_ns)
         self._last_base_ns = max(self._last_base_ns or now_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
-        self._burst = self._recent_bursts()
+        self._note_bursts()
         if not self._settings.yields:
             self._note_used(now_ns)
 
@@ -442,15 +443,17 @@ class RollingBudget:
         return _SPARE_SHARE * self._loan_bytes + self._settings.metadata_bps * self._loan_ns / 8 / SECOND_NS
 
     def backlog_allowance(self, now_ns: int, *, reserve: float | None) -> int:
-        """The line bytes of the backlog that may go now: those that neither base nor stills will need.
+        """The line bytes of the backlog that may go now: those that neither base nor stills will likely need.
 
-        It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one;
-        None: all that is free now, for which the frames to come wait.
+        Of a quiet scene's base only half of the way to its full rate is expected: else, where stills have little, no
+        chunk would ever fit. ``reserve`` is left free of a window, as a share of what stills have of one; None: all
+        that is free now, for which the frames to come wait.
         A camera that is silent may give its next frame at any moment: its room stays free until `end_base`.
         """
         settings = self._settings
         alone = reserve is None or self._base_ended
-        free = self._unspent(now_ns)[0][0] if alone else self._window_allowance(now_ns)
+        likely = self._likely_burst
+        free = self._unspent(now_ns)[0][0] if alone else self._window_allowance(now_ns, burst=likely)
         reserved = (reserve or 0.0) * settings.still_bps * settings.window_ns / 8 / SECOND_NS
         return max(0, int(free - reserved))
 
@@ -512,11 +515,13 @@ class RollingBudget:
         taken = sum(size for at_ns, size in self._base_events if at_ns > first_ns)
         return max(0.0, settings.base_bps * settings.window_ns / 8 / SECOND_NS - taken - borrowed)
 
-    def _window_allowance(self, now_ns: int, events: _Events | None = None) -> float:
+    def _window_allowance(
+        self, now_ns: int, events: _Events | None = None, *, burst: _Floats | None = None
+    ) -> float:
         # The least room over every window that would contain a message sent now, beside base and metadata.
         unspent, ahead_ns = self._unspent(now_ns, events)
         beside = self._settings.metadata_bps / 8 / SECOND_NS * ahead_ns
-        return float((unspent - self._burst - beside).min())
+        return float((unspent - (self._burst if burst is None else burst) - beside).min())
 
     def _unspent(
         self, now_ns: int, events: _Events | None = None
@@ -536,11 +541,16 @@ class RollingBudget:
         spent = upto[-1] - upto[np.searchsorted(times_ns, now_ns - spans_ns, side="right")]
         return self._total - spent, ahead_ns
 
-    def _recent_bursts(self) -> npt.NDArray[np.float64]:
-        # Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast.
+    def _note_bursts(self) -> None:
+        # Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast; and the mean of that and of
+        # what they took of late at most.
         upto = np.cumsum([0, *self._base_steps])
-        most = self._forecasts.astype(np.float64) * self.base_step_bytes
-        for index, count in enumerate(self._forecasts.tolist()):
-            if 0 < count < len(upto):
-                most[index] = max(most[index], float((upto[count:] - upto[:-count]).max()))
-        return most
+        usual = self._forecasts * self.base_step_bytes
+        taken = np.array(
+            [
+                float((upto[k:] - upto[:-k]).max()) if 0 < k < len(upto) else usual[at]
+                for at, k in enumerate(self._forecasts)
+            ]
+        )
+        self._burst: _Floats = np.maximum(usual, taken)
+        self._likely_burst = (self._burst + taken) / 2 if self._settings.yields else self._burst

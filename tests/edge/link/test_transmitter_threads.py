@@ -155,6 +155,26 @@ def test_three_threads_keep_to_one_budget_in_whatever_order_they_run(seed):
     assert rig.ledger.worst_window_bps.total <= TOTAL
 
 
+def test_of_what_a_quiet_scene_leaves_the_backlog_has_most_and_a_busy_one_hardly_waits():
+    """At 300 kbps the base has .95: a chunk never fitted, and of 20 s of video .4 came in 40 s beside 85 kbps."""
+    total, step_ns = 300_000, S // 15
+    budget = RollingBudget(BudgetSettings(total, 285_000, fps=15, metadata_bps=5_000))
+    stored_bytes, waits_ns = [0, 0], []
+    for frame in range(15 * 20):
+        now_ns = NOW_NS + frame * step_ns
+        size = 700 if frame < 150 else round(budget.base_step_bytes)
+        at_ns = budget.earliest_ns(size, now_ns=now_ns, base=True)
+        waits_ns.append(at_ns - now_ns)
+        budget.record_base(size, now_ns=at_ns)
+        room = budget.backlog_allowance(at_ns, reserve=1 / 3)
+        if room >= 1_000:
+            budget.record_other(min(room, 1_875), now_ns=at_ns)
+            stored_bytes[frame >= 165] += min(room, 1_875)
+    assert stored_bytes[0] * 8 / 10 > 0.6 * (total - 85_000)
+    assert stored_bytes[1] == 0, "the base takes its share again"
+    assert max(waits_ns) < step_ns
+
+
 def test_room_for_the_backlog_leaves_what_base_and_stills_will_want():
     """A chunk would take the room of the next frame, or of a still that comes."""
     budget = RollingBudget(BudgetSettings(TOTAL, 400_000, fps=15))
