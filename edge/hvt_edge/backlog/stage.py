@@ -35,9 +35,9 @@ _STEADY_NS = 2 * SECOND_NS
 """The link is back for so long before stored objects are sent: the picture comes first."""
 _PROBE_NS = SECOND_NS
 _RESERVE = 1 / 3
-"""Share of the stills' part of a window that stays free for a live one."""
+"""Share of the stills' part of a window that stays free for a live one; all of it while one is pending."""
 _TRICKLE_BYTES = 1_400
-"""Size of a chunk without room, or while live stills are pending: one packet."""
+"""Size of a chunk without room: one packet."""
 _FINISH_NS, _STUCK_NS, _POLL_S = 60 * SECOND_NS, 6 * SECOND_NS, 0.05
 """How long sending goes on after the end of a clip: in all, and without getting on."""
 
@@ -333,9 +333,9 @@ class BacklogStage:
         # While a keyframe is to come nothing else takes its space; after the last frame none comes.
         if not self._has_subscriber() or not (self._finishing or not self._keyframes.due(now_ns)):
             return None
-        reserve = 0.0 if self._finishing else _RESERVE
+        reserve = 0.0 if self._finishing else 1.0 if self._stills_pending() else _RESERVE
         limit_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=reserve)
-        if self._finishing or (limit_bytes >= LEAST_CHUNK_BYTES and not self._stills_pending()):
+        if self._finishing or limit_bytes >= LEAST_CHUNK_BYTES:
             return ChunkAllowance(limit_bytes)  # after the last frame no still goes any more
         own_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=None)
         return ChunkAllowance(min(_TRICKLE_BYTES, own_bytes), trickle=True)
