@@ -56,13 +56,8 @@ def own_steps(path: Path) -> OwnSteps:
     """What a checked file does to its pixels before all else; nothing, as most."""
     try:
         graph = _ir_graph(path) if is_ir(path) else _onnx_graph(path)
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        ET.ParseError,
-    ):  # it is another now than the one that was opened
-        return OwnSteps()
+    except (OSError, ValueError, LookupError, ET.ParseError):
+        return OwnSteps()  # it is another now than the one that was opened
     slope, offset, turned = _first_steps(*graph)
     if slope is None:
         return OwnSteps(turned=turned)

@@ -272,9 +272,8 @@ def ir_metadata(path: Path) -> dict[str, str]:
     metadata = _yaml_of_ultralytics(path.with_name(_ULTRALYTICS))
     found = (root.find(f"{place}/reverse_input_channels") for place in _OF_CONVERSION)
     turned = any(one is not None and one.get("value", "").lower() in _YES for one in found)
-    order = (
-        {"hvt.channel_order": "BGR"} if turned else {}
-    )  # it is no step of the graph, but in its first weights
+    # It is no step of the graph, but in its first weights.
+    order = {"hvt.channel_order": "BGR"} if turned else {}
     labels = said.pop("labels", "").split()
     if labels and "names" not in metadata:
         metadata["names"] = repr([label.replace("_", " ") for label in labels])
