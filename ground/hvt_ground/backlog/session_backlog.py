@@ -19,6 +19,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, iou
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
+from hvt_ground.perception.guesses import are_firm
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.stills.decode import ReceivedStill
@@ -65,10 +66,11 @@ class LateStills:
     """Stored stills name the tracks of stored video: each the one whose box it shows at its frame.
 
     For one session and one thread. Stills come before the boxes of their frame, and before its ``tilt`` is known.
+    What speaks for a track outweighs that its stills had none; ``scale`` is base pixels per source pixel.
     """
 
-    def __init__(self, tilt: ViewTilt) -> None:
-        self._tilt = tilt
+    def __init__(self, tilt: ViewTilt, *, scale: float) -> None:
+        self._tilt, self._scale = tilt, scale
         self._stills: Newest[int, list[Refinement]] = Newest(_MOST_LATE)
         """Those of no track yet, by frame."""
         self._named: Newest[int, Refinement] = Newest(_MOST_LATE)
@@ -87,10 +89,10 @@ class LateStills:
             shares = iou(np.array([still.box_base_px], np.float32), overlay.boxes_base_px)[0]
             best = int(shares.argmax())
             if shares[best] >= _LEAST_IOU:
-                self._named[tracks[best]] = still
-                before = overlay.base_classes[best]
-                vague = bool(overlay.vague[best]), self._tilt.vague_of(still)[1]
-                yield replace(still, track_id=tracks[best], class_before=before, vague=vague)
+                known = replace(still, track_id=tracks[best], class_before=overlay.base_classes[best])
+                self._named[tracks[best]] = known
+                vague = bool(overlay.vague[best]), self._tilt.vague_of(known)[1]
+                yield replace(known, vague=vague, doubted=self._doubts(known, guess=overlay.doubted[best]))
         stills = [self._named.get(track) for track in tracks]
         if not any(stills):
             yield overlay
@@ -104,9 +106,13 @@ class LateStills:
             classes=tuple(still.class_after if still else name for name, still in classes),
             confidences=np.array([s.confidence if s else own for own, s in confidences], np.float32),
             refined=np.array([still is not None for still in stills], np.bool_),
-            doubted=np.array([s.doubted if s else own for own, s in doubts], np.bool_),
+            doubted=np.array([self._doubts(s, guess=own) if s else own for own, s in doubts], np.bool_),
             vague=np.array([self._tilt.vague_of(s)[1] if s else own for own, s in guesses], np.bool_),
         )
+
+    def _doubts(self, still: Refinement, *, guess: bool) -> bool:
+        firm = are_firm([still.box_base_px], [still.confidence], scale=self._scale)[0]
+        return self._tilt.doubts(still) or bool(guess and not firm)
 
 
 class SessionBacklog:
@@ -136,7 +142,7 @@ class SessionBacklog:
         self._frame_ns = round(SECOND_NS / info.fps)
         self._lock = threading.Lock()
         self._frames = SequenceWindow()
-        self._late = LateStills(ViewTilt() if perception is None else perception.tilt)
+        self._late = LateStills(ViewTilt() if perception is None else perception.tilt, scale=info.view.scale)
         self.totals = BacklogTotals()
         self._news = BacklogTotals()
 

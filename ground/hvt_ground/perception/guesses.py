@@ -16,8 +16,9 @@ import numpy.typing as npt
 
 from hvt_common.camera_motion import Affine
 from hvt_common.inference.class_names import group_of
-from hvt_common.values import Tracks
+from hvt_common.values import Boxes, Tracks
 from hvt_ground.events import Refinement
+from hvt_ground.perception.stills.posterior import LEAST_SURE_PX, SURE
 
 _LIKELY, _LIKELY_ODD = 0.5, 0.65
 """From this mean confidence on it is more likely right than not; a person, one much larger than others or on one."""
@@ -51,10 +52,13 @@ class _Evidence:
 
 
 class Guesses:
-    """Of one video, whose detector's scores are probabilities. Frames rise; for one thread."""
+    """Of one video, whose detector's scores are probabilities; ``scale`` is base pixels per source pixel.
 
-    def __init__(self, *, fps: float) -> None:
-        self._fps = fps
+    Frames rise; for one thread.
+    """
+
+    def __init__(self, *, fps: float, scale: float = 1.0) -> None:
+        self._fps, self._scale = fps, scale
         self._seen: dict[int, _Evidence] = {}
         self._frame = 0
         self._ids: frozenset[int] = frozenset()
@@ -99,6 +103,8 @@ class Guesses:
 
     def doubting(self, still: Refinement) -> Refinement:
         """What a still says that is not sure, doubted where its track is a guess, or it has none."""
+        if still.unread or are_firm([still.box_base_px], [still.confidence], scale=self._scale)[0]:
+            return still
         guess = still.track_id is None or bool(self.among(np.array([still.track_id]))[0])
         return replace(still, doubted=still.doubted or guess)
 
@@ -130,6 +136,18 @@ class Guesses:
             if weak and not (usual or moved):
                 found.add(ids[row])
         return frozenset(found)
+
+
+def are_firm(
+    boxes_base_px: Boxes | Sequence[tuple[float, ...]],
+    confidences: npt.NDArray[np.floating] | Sequence[float],
+    *,
+    scale: float,
+) -> npt.NDArray[np.bool_]:
+    """(N,) True where stills know them, however weak they are on the base; ``scale`` is base per source pixel."""
+    boxes = np.asarray(boxes_base_px)
+    sides = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf)
+    return np.asarray((np.asarray(confidences) > SURE) & (sides >= LEAST_SURE_PX * scale))
 
 
 def _is_on(box: _Floats, others: _Floats) -> bool:

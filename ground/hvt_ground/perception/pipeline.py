@@ -23,12 +23,11 @@ from hvt_common.video.hevc import Picture, YuvPicture
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
-from hvt_ground.perception.guesses import Guesses
+from hvt_ground.perception.guesses import Guesses, are_firm
 from hvt_ground.perception.history import History, as_bgr
 from hvt_ground.perception.models import Detection, DetectorThread
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.stills.posterior import LEAST_SURE_PX, SURE
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
@@ -417,9 +416,8 @@ class Pipeline:
         pending, guesses = self._pending, self._parts.guesses
         while pending:
             event = pending.pop(0)
-            if guesses is not None and isinstance(event, Refinement) and not event.unread:
-                firm = self._are_firm(np.array([event.box_base_px]), np.array([event.confidence]))
-                event = event if firm[0] else guesses.doubting(event)
+            if guesses is not None and isinstance(event, Refinement):
+                event = guesses.doubting(event)
             self._emit(event)
 
     def _doubting(self, shown: Overlay) -> Overlay:
@@ -428,20 +426,13 @@ class Pipeline:
         guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
         doubted = shown.doubted
         if guesses is not None:
-            firm = shown.refined & self._are_firm(shown.boxes_base_px, shown.confidences)
+            firm = shown.refined & are_firm(shown.boxes_base_px, shown.confidences, scale=self._scale)
             doubted = doubted | guesses.among(shown.track_ids) & ~firm
             vague = vague & ~guesses.agreed(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
         if self.trust.unlike:
             doubted = doubted | np.array([one == "base" for one in shown.origins], np.bool_) & ~shown.refined
             sure = np.zeros_like(sure)
         return replace(shown, doubted=doubted, sure=sure, vague=vague)
-
-    def _are_firm(
-        self, boxes_base_px: npt.NDArray[np.floating], confidences: npt.NDArray[np.floating]
-    ) -> npt.NDArray[np.bool_]:
-        # Whether stills know them, however weak they are on the base.
-        sides = (boxes_base_px[:, 2:] - boxes_base_px[:, :2]).min(axis=1, initial=np.inf)
-        return np.asarray((confidences > SURE) & (sides >= LEAST_SURE_PX * self._scale))
 
     def _inside(self, shown: Overlay) -> Overlay:
         # The tracker lets boxes leave the picture.

@@ -22,7 +22,7 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Image
 from hvt_ground.config import DETECTOR, GroundConfig
-from hvt_ground.events import Event, Overlay
+from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.guesses import Guesses
@@ -134,10 +134,16 @@ class SessionPerception:
 
     def read(self, still: ReceivedStill, *, emit: Emit) -> None:
         """Decode, name and give out a still of a session that is over: no track of it is here to be matched."""
-        info = self._info
+        info, guesses = self._info, self._guesses()
         detector, reader = self._taken()
         names, edge_classes = unified_names(detector.class_names, info.class_names)
         vocabulary = Vocabulary(names, reader.class_names)
+
+        def doubting(event: Event) -> None:
+            if guesses is not None and isinstance(event, Refinement):
+                event = guesses.doubting(event)
+            emit(event)
+
         stage = StillStage(
             reader,
             Refiner("fuse", fps=info.fps, vocabulary=vocabulary, tilt=self.tilt),
@@ -146,7 +152,7 @@ class SessionPerception:
             fusion=self._fusion(edge_classes, CameraPath(ahead_frames=1)),
             view=info.view,
             gap_frames=1,
-            emit=emit,
+            emit=doubting,
         )
         header = still.header
         moment = Progress(header.frame_index, header.capture_ns, picture_index=header.frame_index)
@@ -167,7 +173,8 @@ class SessionPerception:
         return Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale)
 
     def _guesses(self) -> Guesses | None:
-        return Guesses(fps=self._info.fps) if self._models.facts.calibrated else None
+        info = self._info
+        return Guesses(fps=info.fps, scale=info.view.scale) if self._models.facts.calibrated else None
 
     def _scale_search(self, detector: FailingDetector) -> ScaleSearch | None:
         # What it promises are sums of probabilities. The hint that little is found counts pictures, not their parts.

@@ -343,22 +343,36 @@ def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own)
     assert (after.class_after, after.refined, after.label) == ("bus", True, f"{FIRST_TRACK_ID} bus")
 
 
-def test_a_still_names_its_own_track_and_no_guess_beside_it():
-    """One named car in stored video made every guess around it as firm as itself."""
-    late = LateStills(ViewTilt())
-    bus = Posterior("bus", 0.9, 0.3, np.array([0.1, 0.9], np.float32))
-    late.take(replace(seen(0, 5, bus, (0.0, 0.0, 20.0, 20.0), edge=1).event, stored=True))
+@pytest.mark.parametrize(
+    ("confidence", "guess", "word"), [(0.95, True, "bus"), (0.7, True, "something"), (0.7, False, "bus")]
+)
+def test_a_still_names_its_own_track_and_no_guess_beside_it(confidence, guess, word):
+    """One named car made every guess around it as firm as itself, and one that came before its track doubted that."""
+    late = LateStills(ViewTilt(), scale=1.0)
+    bus = Posterior("bus", confidence, 0.3, np.array([1 - confidence, confidence], np.float32))
+    still = replace(seen(0, 5, bus, (0.0, 0.0, 20.0, 20.0), edge=1).event, stored=True)
+    late.take(replace(still, doubted=confidence < 0.9))
     boxes = np.array([(0, 0, 20, 20), (50, 50, 60, 60), (80, 80, 90, 90)], np.float32)
-    doubted = np.array([True, True, False])
-    *_, shown = late.named(overlay(5, boxes, stored=True, doubted=doubted))
-    assert shown.words == ("bus", "something", "car")
+    doubted = np.array([guess, True, False])
+    still, shown = late.named(overlay(5, boxes, stored=True, doubted=doubted))
+    assert shown.words == (word, "something", "car")
+    assert still.doubted == (word == "something")
+
+
+def test_a_still_of_a_session_that_is_over_is_doubted_as_it_is_live(flight):
+    """Without a track, and not sure, it was a bus in the list of stills."""
+    found, item = [], flight.still(3, 0)
+    perception = StoredPerception(flight.info(), tilt=ViewTilt())
+    header = RoiHeader.parse(item.attachment, item.payload)
+    perception.read(ReceivedStill(header, item.payload), emit=found.append)
+    assert [(one.class_after, one.doubted) for one in found] == [("bus", True)]
 
 
 @pytest.mark.parametrize(("confidence", "word"), [(0.7, "vehicle"), (0.95, "bus")])
 def test_a_still_of_an_outage_is_called_as_the_box_that_it_names(confidence, word):
     """Seen aslant the live picture said vehicle, and what came of the same view afterwards a kind of it."""
     tilt = ViewTilt(vague_kinds=True)
-    late = LateStills(tilt)
+    late = LateStills(tilt, scale=1.0)
     bus = Posterior("bus", confidence, 0.3, np.array([1 - confidence, confidence], np.float32))
     late.take(replace(seen(0, 5, bus, (0.0, 0.0, 20.0, 20.0), edge=1).event, stored=True))
     tilt.aslant = True

@@ -18,7 +18,7 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
-from hvt_ground.perception import pipeline
+from hvt_ground.perception import guesses
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import as_bgr
 from hvt_ground.perception.models import DetectorThread
@@ -330,7 +330,7 @@ def test_a_guess_stays_one_until_a_still_is_sure_of_it(
     flight, pictures, monkeypatch, confidence, least_px, doubted
 ):
     """Stills made firm pedestrians of lane marks, by .6, and of a shrub of nine pixels by .99."""
-    monkeypatch.setattr(pipeline, "LEAST_SURE_PX", least_px)
+    monkeypatch.setattr(guesses, "LEAST_SURE_PX", least_px)
 
     class Doubts(Guesses):
         def among(self, ids):

@@ -281,10 +281,8 @@ class Refiner:
         return replace(still, event=event, outcome=outcome)
 
     def _unmatched(self, still: StillSeen, outcome: Outcome) -> StillSeen:
-        doubted, event = self._vocabulary.says_nothing(still.posterior.class_name), still.event
-        known = self.tilt.aslant is False and event.confidence > SURE
-        doubted |= are_apart(event.class_before, event.class_after) and not known
-        event = replace(event, doubted=doubted, vague=self.tilt.vague_of(event))
+        event = still.event
+        event = replace(event, doubted=self.tilt.doubts(event), vague=self.tilt.vague_of(event))
         return replace(still, event=event, outcome=outcome)
 
     # The posterior of each track.
@@ -372,6 +370,12 @@ class ViewTilt:
     def is_vague(self, name: str, *, known: bool = False) -> bool:
         """Whether this is a vehicle, and its class rather a guess; ``known`` where stills agree on it."""
         return self._vague_kinds and not known and kind_of(name) in VEHICLE_KINDS
+
+    def doubts(self, still: Refinement) -> bool:
+        """Whether a still by itself says that the object is nothing, or no such thing as it was before."""
+        known = self.aslant is False and still.confidence > SURE
+        apart = are_apart(still.class_before, still.class_after) and not known
+        return is_nothing(still.class_after) or apart
 
     def vague_of(self, still: Refinement) -> tuple[bool, bool]:
         """`Refinement.vague` of a still of no track, which speaks for itself."""

@@ -59,10 +59,6 @@ class Vocabulary:
         if MOVING in self.names:
             self._unspoken[self.names.index(MOVING)] = False
 
-    def says_nothing(self, name: str) -> bool:
-        """Whether a class of ``names`` is nothing of mine."""
-        return self.nothing is not None and name == self.names[self.nothing]
-
     def vote(self, said: Posterior, *, called: str, side_px: float) -> tuple[Posterior | None, str]:
         """Translate the reader's answer; ``called`` is the edge's name of the object, ``side_px`` its shorter side.
 
