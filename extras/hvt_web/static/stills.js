@@ -47,10 +47,14 @@ export class Stills {
     for (const still of this.pending.splice(0)) this.show(still);
   }
 
-  /** @param {Still} still once for all objects of it of which the same is to be said */
+  /** @param {Still} still once for all objects of it of which the same is to be said: each is outlined */
   show(still) {
     const title = stillTitle(still);
-    if ([...this.list.querySelectorAll("button")].some((one) => one.dataset.still === still.id && one.dataset.said === title)) return;
+    const same = [...this.list.querySelectorAll("button")].find((one) => one.dataset.still === still.id && one.dataset.said === title);
+    if (same) {
+      for (const frame of same.querySelectorAll("svg")) outline(still, frame);
+      return;
+    }
     const item = document.createElement("li");
     const button = make("button", "", item);
     button.dataset.still = still.id;
@@ -63,7 +67,7 @@ export class Stills {
       }
       const view = make("span", "view", pair);
       const picture = make("img", "", view);
-      outline(still, view);
+      if (still.crop) outline(still, view.appendChild(framed(still.crop)));
       picture.src = address(still, which);
       picture.loading = "lazy";
       picture.alt = which === "still" ? stillAlt(still) : BASE_ALT;
@@ -71,19 +75,21 @@ export class Stills {
     const words = make("span", "words", button);
     words.textContent = stillWords(still);
     make("small", "", words).textContent = stillReason(still);
-    button.addEventListener("click", () => this.open(still));
+    button.addEventListener("click", () => this.open(still, button));
     this.list.prepend(item);
     while (this.list.children.length > MOST) this.list.lastElementChild?.remove();
   }
 
-  /** @param {Still} still */
-  open(still) {
+  /** @param {Still} still @param {HTMLElement} row of the list */
+  open(still, row) {
     for (const which of ["still", "base"]) {
       const picture = this.part(`#large-${which}`);
       picture.closest("figure").hidden = !still.shows.includes(which);
       if (!still.shows.includes(which)) continue;
       picture.src = address(still, which);
-      outline(still, picture.parentElement);
+      picture.parentElement.querySelector("svg")?.remove();
+      const frame = row.querySelector("svg");
+      if (frame) picture.parentElement.append(frame.cloneNode(true));
     }
     this.part("#large-text").textContent = stillTitle(still);
     this.large.showModal();
@@ -95,19 +101,23 @@ export class Stills {
   }
 }
 
+/** @param {"svg" | "rect"} kind */
+const drawing = (kind) => document.createElementNS("http://www.w3.org/2000/svg", kind);
+
+/** @param {number[]} crop */
+function framed([x, y, right, bottom]) {
+  const frame = drawing("svg");
+  frame.setAttribute("viewBox", [x, y, right - x, bottom - y].join(" "));
+  return frame;
+}
+
 /**
  * Which of the objects of the still is meant.
- * @param {Still} still @param {HTMLElement} view has the picture
+ * @param {Still} still @param {Element} frame of its picture
  */
-function outline(still, view) {
-  view.querySelector("svg")?.remove();
-  if (!still.crop) return;
-  const [shown, meant] = [still.crop, still.box].map(([x, y, right, bottom]) => ({ x, y, width: right - x, height: bottom - y }));
-  const [frame, outlined] = ["svg", "rect"].map((kind) => document.createElementNS("http://www.w3.org/2000/svg", kind));
-  frame.setAttribute("viewBox", Object.values(shown).join(" "));
-  for (const [name, value] of Object.entries(meant)) outlined.setAttribute(name, `${value}`);
-  frame.append(outlined);
-  view.append(frame);
+function outline({ box: [x, y, right, bottom] }, frame) {
+  const outlined = frame.appendChild(drawing("rect"));
+  for (const [name, value] of Object.entries({ x, y, width: right - x, height: bottom - y })) outlined.setAttribute(name, `${value}`);
 }
 
 /** @param {Still} still @param {string} which */

@@ -1,0 +1,47 @@
+"""The list of stills shows which objects each line is about."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import hvt_web
+
+STILLS = Path(hvt_web.__file__).parent / "static" / "stills.js"
+NODE = shutil.which("node")
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+def test_each_object_of_a_line_is_outlined():
+    """Of two cars of which the same is to be said the second was nowhere: the line seemed to be about the first."""
+    script = f"""
+      const within = (one) => one.children.flatMap((child) => [child, ...within(child)]);
+      const element = (kind) => {{
+        const one = {{ kind, dataset: {{}}, children: [], addEventListener() {{}}, contains: () => false }};
+        const take = (child) => (one.children.push(child), child);
+        const all = (kind) => within(one).filter((child) => child.kind === kind);
+        return Object.assign(one, {{ append: take, appendChild: take, prepend: take, querySelectorAll: all,
+          setAttribute: (name, value) => {{ one[name] = value; }} }});
+      }};
+      globalThis.document = {{ createElement: element, createElementNS: (_, kind) => element(kind) }};
+      const {{ Stills }} = await import({json.dumps(STILLS.as_uri())});
+      const list = element("ol");
+      const stills = new Stills(list, element("dialog"));
+      const still = {{ id: "1", captured: 0, shows: ["still"], crop: [0, 0, 9, 9], track: null, after: "car" }};
+      for (const x of [1, 5]) stills.add({{ ...still, box: [x, 2, x + 3, 4] }});
+      const lines = list.children.map((line) => line.querySelectorAll("rect").map((one) => [one.x, one.width]));
+      console.log(JSON.stringify(lines));
+    """
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [[["1", "3"], ["5", "3"]]]
