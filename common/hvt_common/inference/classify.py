@@ -5,7 +5,7 @@ How pixels are prepared, first rule that applies:
 1. The model's metadata says it: ``hvt.mean`` and ``hvt.scale`` (one number or three, network value =
    (pixel - mean) * scale, pixels 0…255, numbers in the order of the network's channels) and ``hvt.channel_order``
    (``RGB`` or ``BGR``).
-2. The network's first steps subtract a mean or divide: plain pixels, 0…1 or 0…255 as these say.
+2. The network takes uint8, or its first steps subtract a mean or divide: plain pixels, 0…1 or 0…255 as these say.
 3. The metadata say Ultralytics' classify (``author``, ``task``): RGB, pixel / 255.
 4. 1001 classes, TensorFlow's ImageNet with a background class: RGB, (pixel - 128) / 128.
 5. An OpenVINO model (``.xml``): BGR 0…255, as the Open Model Zoo takes them.
@@ -143,8 +143,11 @@ class OnnxClassifier:
         # (output, classes, whether logits): probabilities add up to 1, or lie in 0…1; of several, as many as names.
         batch, (width, height) = self._batch or 1, self._size
         shape = (batch, 3, height, width) if self._channels_first else (batch, height, width, 3)
-        noise = np.random.default_rng(0).normal(0, 1, shape)
-        runs = [self.model.run((noise * top).astype(self.model.inputs[0].dtype)) for top in (1, _OPPOSITE)]
+        noise, dtype = np.random.default_rng(0).normal(0, 1, shape), self.model.inputs[0].dtype
+        pictures = [noise, noise * _OPPOSITE]
+        if dtype == np.uint8:
+            pictures = [np.clip(128 + 64 * one, 0, 255) for one in (noise, -noise)]
+        runs = [self.model.run(one.astype(dtype)) for one in pictures]
         rows = {
             index: np.stack([run[index].reshape(batch, -1)[0].astype(np.float64) for run in runs])
             for index, output in enumerate(runs[0])
@@ -180,8 +183,8 @@ def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
     shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
     if len(shape) != 4 or 3 not in (shape[1], shape[3]):
         raise UserError(_not_a_classifier(model, "its input is not one image of three channels"))
-    if model.inputs[0].dtype not in (np.float32, np.float16):
-        raise UserError(_not_a_classifier(model, "its input is neither float32 nor float16"))
+    if model.inputs[0].dtype not in (np.float32, np.float16, np.uint8):
+        raise UserError(_not_a_classifier(model, "its input is neither float32, float16 nor uint8"))
     channels_first = shape[1] == 3
     said = [int(word) for word in re.findall(r"\d{2,4}", model.metadata.get("imgsz", ""))]  # height, width
     usual = (said * 2)[:2] if said else [_USUAL_SIDE, _USUAL_SIDE]
@@ -217,11 +220,12 @@ def _preparation(model: OnnxModel, classes: int) -> tuple[Preparation, str]:
         usual, why = _OPEN_MODEL_ZOO, "assumed, as the Open Model Zoo takes them"
     else:
         usual, why = Preparation.torchvision(), "assumed, as torchvision trains"
-    own = own_steps(model.path)
-    usual, why = usual.beside(own), why if own.top is None else "it scales them itself"
+    own, dtype = own_steps(model.path), model.inputs[0].dtype
+    usual = usual.beside(own)
+    why = "it scales them itself" if own.top is not None or dtype == np.uint8 else why
     if any(key.startswith("hvt.") for key in said):
         why = "its metadata say so"
-    return prepared_as(model.path, said, usual), why
+    return prepared_as(model.path, said, usual, dtype), why
 
 
 def _class_names(

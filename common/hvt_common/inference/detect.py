@@ -21,7 +21,7 @@ from hvt_common.inference.labels import (
     detector_labels,
     read_labels,
 )
-from hvt_common.inference.letterbox import Letterboxer, Preparation, as_bgr, prepared_as
+from hvt_common.inference.letterbox import Letterboxer, as_bgr, prepared_as
 from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
 from hvt_common.inference.runtimes.first_steps import own_steps
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
@@ -198,11 +198,9 @@ class OnnxDetector:
         except UserError as error:
             raise UserError(_not_a_detector(model, str(error), channels_last=self._channels_last)) from None
         usual = self.head.preparation.beside(own_steps(model.path))
-        self.preparation = prepared_as(model.path, model.metadata, usual)
         dtype = model.inputs[0].dtype
         assert dtype is not None
-        if dtype == np.uint8:  # it scales the pixels itself
-            self.preparation = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=self.preparation.rgb)
+        self.preparation = prepared_as(model.path, model.metadata, usual, dtype)
         said_by = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"
         self.class_names = detector_labels(
             *(model.path, names, said_by),

@@ -61,16 +61,20 @@ class Preparation:
         return f"{order}, (pixel - {mean}) / {divisor}"
 
 
-def prepared_as(path: Path, metadata: Mapping[str, str], usual: Preparation) -> Preparation:
+def prepared_as(
+    path: Path, metadata: Mapping[str, str], usual: Preparation, dtype: np.dtype[Any] | None
+) -> Preparation:
     """Pixels by a model's metadata (``hvt.mean``, ``hvt.scale``, ``hvt.channel_order``), else as usual.
 
-    Raises `UserError` where they make no sense.
+    A network whose input ``dtype`` is uint8 scales them itself. Raises `UserError` where they make no sense.
     """
     order = metadata.get("hvt.channel_order", "RGB" if usual.rgb else "BGR").upper()
     if order not in ("RGB", "BGR"):
         raise UserError(
             f"model {path} has hvt.channel_order '{order}' in its metadata; RGB or BGR is accepted"
         )
+    if dtype == np.uint8:
+        return Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=order == "RGB")
     return Preparation(
         mean=_three_numbers(path, metadata, "hvt.mean", usual.mean),
         scale=_three_numbers(path, metadata, "hvt.scale", usual.scale),

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from onnx import TensorProto
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
@@ -52,6 +53,7 @@ def test_pixels_are_prepared_by_the_documented_rule(
     ("steps", "expected"),
     [
         ([("Div", 255)], np.array([50, 100, 200]) / 255),
+        ([("Cast", TensorProto.UINT8), ("Mul", 0.02)], np.array([50, 100, 200]) * 0.02),
         ([("Cast", None), ("Mul", 1 / 127.5), ("Sub", 1)], np.array([50, 100, 200]) / 127.5),
         ([("Sub", 0.5), ("Div", 0.5)], np.array([50, 100, 200]) / 127.5),
         ([("Shape", None), ("Sub", 0), ("Div", 255)], np.array([50, 100, 200]) / 255),

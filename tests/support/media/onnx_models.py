@@ -56,7 +56,8 @@ def scaling_inside(path: Path, steps: Sequence[tuple[str, Any]]) -> Path:
         extra = {"Cast": {"to": TensorProto.FLOAT}, "Gather": {"axis": 1}}.get(kind, {})
         if kind == "Slice":
             constants = [np.array([one], np.int64) for one in value]
-        elif value is None:
+        elif value in (None, TensorProto.UINT8):  # a Cast, of what goes in
+            graph.input[0].type.tensor_type.elem_type = value or TensorProto.FLOAT
             constants = []
         else:
             shape, dtype = ((-1,), np.int64) if kind == "Gather" else ((-1, 1, 1), np.float32)
