@@ -138,8 +138,8 @@ class Pictures:
             own = np.asarray(levels, np.uint16) >> (16 - bits)
             return self._stretch.bgr(own, at_s=frame.time or 0.0, bits=bits)
         more: dict[str, Any] = {}
-        if not frame.format.is_rgb and not name.startswith("gray"):
-            if frame.colorspace not in _CONVERTED:
+        if not name.startswith("gray"):
+            if not frame.format.is_rgb and frame.colorspace not in _CONVERTED:
                 matrix = matrix_of(frame)
                 standard = "BT.709" if matrix == _BT709 else "BT.601"
                 said = int(frame.colorspace)
