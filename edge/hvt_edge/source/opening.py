@@ -30,6 +30,8 @@ _ACCEPTED = (
     "a video file, a folder of images, rtsp://…, rtmp://…, http://…, udp://…, FILE.sdp, /dev/videoN, demo or "
     "demo:codes,4k"
 )
+_PIPE = re.compile(r"-|(?:pipe|fd):.*|/dev/(?:stdin|fd/.*)|.*\s!\s.*", re.DOTALL)
+"""What is written for standard input, and for a pipeline of GStreamer."""
 
 
 def open_source(  # noqa: PLR0911 - one return a kind of source
@@ -103,17 +105,17 @@ def _check_address(spec: str, scheme: str) -> None:
 
 def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
     # A file that another program writes may be yet to come: `NotYetError`.
+    if not _is_played(spec) and (_is_there(spec) or _PIPE.fullmatch(spec)):
+        raise UserError(
+            f"source {shown(spec)!r} is neither a file nor a folder; what a program writes into a pipe, or GStreamer "
+            "plays, can be sent to udp://127.0.0.1:PORT as MPEG-TS"
+        )
     if scheme:
         known = scheme if re.fullmatch(r"[a-z][a-z0-9+.-]{0,15}", scheme) else HIDDEN
         raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
     if not _is_there(spec):
         kind = NotYetError if growing else UserError
         raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
-    if not _is_played(spec):  # it is looked at before
-        raise UserError(
-            f"source {spec!r} is neither a file nor a folder; what a program writes into a pipe can be sent to "
-            "udp://127.0.0.1:PORT"
-        )
     if growing and Path(spec).is_file() and not Path(spec).stat().st_size:
         raise NotYetError(f"source {spec!r} is empty so far")
 
@@ -125,7 +127,7 @@ def shown(spec: str) -> str:
 
 def _is_device(spec: str) -> bool:
     # A file or a folder there is one, as in /dev/shm.
-    return spec.startswith("/dev/") and not _is_played(spec)
+    return spec.startswith("/dev/") and not (_is_played(spec) or _PIPE.fullmatch(spec))
 
 
 def _is_played(spec: str) -> bool:

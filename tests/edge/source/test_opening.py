@@ -649,8 +649,8 @@ def test_a_name_that_none_can_have_is_one_sentence(coded):
 def test_a_pipe_is_no_clip(tmp_path, growing):
     """It was called an empty file, and with ``--follow`` waited for without a word."""
     os.mkfifo(tmp_path / "a.ts")
-    with pytest.raises(UserError, match="is neither a file nor a folder"):
-        open_source(str(tmp_path / "a.ts"), size=(64, 64), fps=5, growing=growing)
+    for spec in (tmp_path / "a.ts", "-", "pipe:0", "rtspsrc location=rtsp://10.0.0.5/1 ! appsink"):
+        assert "is neither a file nor a folder" in refused(str(spec), growing=growing)
 
 
 def test_a_clip_in_memory_is_no_camera():
