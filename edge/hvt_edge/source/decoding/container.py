@@ -306,9 +306,13 @@ class _Reading:
         return max(self._count, math.ceil((self._end_s or 0) * (self._stream.average_rate or 0)))
 
     def _lacks_pictures(self) -> str:
-        # The same of formats without an index, by their bytes.
+        # The same of formats without an index, and of two MP4 put together, by their bytes.
         name, size = self._container.format.name, self._size or 0
-        behind = 1 - self._end_byte / size if size and name in _WITHOUT_INDEX else 0
+        joined = (
+            "mp4" in name and _boxes_of(Path(self._container.name.removeprefix("file:"))).count(b"moov") > 1
+        )
+        ends = name in _WITHOUT_INDEX or (joined and self._stream.frames)
+        behind = 1 - self._end_byte / size if size and ends else 0
         if behind > _MOST_BEHIND:
             return f"its last {behind:.0%} hold nothing of this film, but perhaps another recording"
         broken = name == "mpegts" and all(size % one for one in _TS_BYTES)
@@ -350,7 +354,18 @@ def _decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
 
 
 def _lacks_index(path: Path) -> str:
-    # The fault of an MP4 whose index is missing; empty for anything else (ISO/IEC 14496-12, 4.2).
+    # The fault of an MP4 whose index is missing; empty for anything else.
+    kinds = _boxes_of(path)
+    if kinds[:1] != [b"ftyp"] or b"moov" in kinds:
+        return ""
+    return (
+        "unfinished: an MP4 has its index (moov) at its end, and this one has none, because it was cut or is still "
+        "recorded; Matroska, MPEG-TS and fragmented MP4 can be read so far, and while they grow with --follow"
+    )
+
+
+def _boxes_of(path: Path) -> list[bytes]:
+    # The kinds of the first boxes of an MP4 (ISO/IEC 14496-12, 4.2).
     kinds: list[bytes] = []
     with suppress(OSError), path.open("rb") as file:
         end = path.stat().st_size
@@ -364,12 +379,7 @@ def _lacks_index(path: Path) -> str:
             if size < 8:
                 break
             at += size
-    if kinds[:1] != [b"ftyp"] or b"moov" in kinds:
-        return ""
-    return (
-        "unfinished: an MP4 has its index (moov) at its end, and this one has none, because it was cut or is still "
-        "recorded; Matroska, MPEG-TS and fragmented MP4 can be read so far, and while they grow with --follow"
-    )
+    return kinds
 
 
 def _seconds(stamp: int | None, base: Fraction | None) -> Fraction | None:

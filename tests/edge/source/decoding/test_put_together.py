@@ -64,7 +64,9 @@ def test_a_playlist_without_its_end_plays_from_its_beginning(tmp_path, growing):
     assert [number_of(one) for one in play(playlist, growing=growing)] == list(range(30))
 
 
-@pytest.mark.parametrize(("ending", "options"), [("ts", {"mpegts_pmt_start_pid": "4200"}), ("flv", {})])
+@pytest.mark.parametrize(
+    ("ending", "options"), [("ts", {"mpegts_pmt_start_pid": "4200"}), ("flv", {}), ("mp4", {})]
+)
 def test_a_recording_behind_the_film_is_said(tmp_path, caplog, ending, options):
     """FFmpeg ends with the first: half of a file was lost without a word, or the edge ended in a traceback."""
     clip = put_together(
