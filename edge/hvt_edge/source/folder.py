@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -65,6 +66,14 @@ def _gaps(files: list[Path]) -> str:
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
+def pages_of(file: Path) -> str:
+    """That a file holds more than one picture, in words; empty where it does not."""
+    count = 0
+    with suppress(cv2.error):  # its header says what no memory holds
+        count = cv2.imcount(str(file))
+    return f"{file.name} holds {count} pictures: of a file the first alone is shown" if count > 1 else ""
+
+
 class FolderSource(Source):
     """Images in natural order, one every 1 / ``source_fps`` seconds; another size is fitted into the first one's.
 
@@ -82,16 +91,17 @@ class FolderSource(Source):
             raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
         notes = Notes(spec)
         self._stretch = Stretch(notes)
-        images = (_bgr(file, self._stretch, at_s=0.0) for file in self._files)
-        first = next((image for image in images if image is not None), None)
+        images = ((_bgr(file, self._stretch, at_s=0.0), file) for file in self._files)
+        first, shown = next((one for one in images if one[0] is not None), (None, Path(spec)))
         if first is None:
             raise UserError(
                 f"source folder {spec!r} holds {len(self._files)} image files, none of which can be read"
             )
         if settings.source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
-        if gaps := _gaps(self._files):
-            notes(gaps)
+        for said in (_gaps(self._files), pages_of(shown)):
+            if said:
+                notes(said)
         self.notes = notes.taken()
         self._first = first
         self._period_s = 1 / exact_rate(fps if settings.source_fps is None else settings.source_fps)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import av
+import cv2
 import pytest
 
 from hvt_edge.source.opening import open_source
@@ -74,6 +75,14 @@ def test_a_recording_behind_the_film_is_said(tmp_path, caplog, ending, options):
     )
     assert [number_of(one) for one in play(clip)] == list(range(60))
     assert "hold nothing of this film, but perhaps another recording" in caplog.text
+
+
+@pytest.mark.parametrize("source", [".", "0.tiff"])
+def test_of_a_file_of_many_pictures_it_is_said_that_one_is_shown(tmp_path, source):
+    """A thermal recording of minutes, in one TIFF, was one picture, without a word."""
+    cv2.imwritemulti(str(tmp_path / "0.tiff"), [numbered(0), numbered(1)])
+    with open_source(str(tmp_path / source), size=(320, 240), fps=1) as opened:
+        assert "0.tiff holds 2 pictures: of a file the first alone is shown" in " ".join(opened.notes)
 
 
 def test_pixels_are_made_square_when_their_shape_changes_too(tmp_path):
