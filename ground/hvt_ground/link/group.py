@@ -177,8 +177,8 @@ class GroundGroup:
         for edge in self._own.keys() - known:
             self._withdraw(edge)
         with self._lock:
-            for edge in self._mine.keys() - known:
-                del self._mine[edge]
+            for edge in (self._mine.keys() | self._unclaimed_s.keys()) - known:
+                self._mine.pop(edge, None)
                 self._unclaimed_s.pop(edge, None)
 
     def __enter__(self) -> Self:

@@ -120,6 +120,20 @@ def test_an_edge_that_its_member_does_not_accept_is_served_by_another(sessions, 
     absent.undeclare()
 
 
+def test_an_edge_that_comes_back_waits_for_its_member_anew():
+    """It was taken from a member that had no time to claim it; and names of edges that are none filled the memory."""
+    edge, now_s, session = next(one for one in EDGES if owner_of(one, "ab") == "b"), [0.0], MagicMock()
+    group = GroundGroup(session, "north", member="a", clock=lambda: now_s[0])
+    on_token = session.liveliness().declare_subscriber.call_args.args[1]
+    token = MagicMock(key_expr=GroupKeys("north").member("b"), kind=zenoh.SampleKind.PUT)
+    on_token(token)
+    for now_s[0] in (5.0, 20.0, 25.0):
+        assert not group.serves(edge)
+        on_token(token)
+        group.forget(except_for=())
+    assert not session.liveliness().declare_token.call_args.args[0].endswith(edge)
+
+
 def test_a_page_is_asked_for_until_it_is_known(sessions):
     """Its tile would lead nowhere for as long as both run."""
     keys = GroupKeys("north")
