@@ -65,7 +65,6 @@ class WebExtra(Extra[WebOptions]):
             failures=failures,
             keys=key_pair(config.link),
             proxy=config.web_proxy,
-            recorded=config.record is not None,
         )
 
 

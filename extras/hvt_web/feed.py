@@ -162,11 +162,8 @@ def still_name(info: Info, still: Refinement) -> str:
     return f"{info.session_id & 0xFFFFFF:06x}-{still.still_sequence}"
 
 
-def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
-    """The state of all edges, for the wall and the plot; the words that an operator reads are made here.
-
-    ``recorded``: this ground writes recordings; None where that is not known.
-    """
+def state_message(state: GroundState) -> str:
+    """The state of all edges, for the wall and the plot; the words that an operator reads are made here."""
     failing = {part.part for part in state.failed}
     edges = {
         one.edge: {
@@ -178,8 +175,8 @@ def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
             "method": None if one.session is None else one.session.method,
             "short": "" if one.session is None else _short(one, state.at_ns),
             "recording": None
-            if recorded is None or one.session is None
-            else recorded and not failing & {f"recording of {one.edge}", "recording"},
+            if one.session is None
+            else state.recorded and not failing & {f"recording of {one.edge}", "recording"},
             "why": [] if one.session is None else _why(one.session),
             "words": []
             if one.session is None

@@ -60,8 +60,7 @@ class WebPage(Service):
     An address that is not there yet, or a port that is not free, is waited for; without ``failures`` nobody hears.
 
     ``keys``, a certificate and its key, encrypt it beyond loopback. ``proxy`` is the host for which a reverse proxy
-    on this machine answers, ``recorded`` whether this ground writes recordings. Raises `UserError` where the address,
-    the tokens or the keys cannot be used.
+    on this machine answers. Raises `UserError` where the address, the tokens or the keys cannot be used.
     """
 
     def __init__(
@@ -72,7 +71,6 @@ class WebPage(Service):
         failures: Failures | None = None,
         keys: tuple[Path, Path] | None = None,
         proxy: str | None = None,
-        recorded: bool | None = None,
     ) -> None:
         host, port = host_and_port(address, name="--web", example="127.0.0.1:8080")
         if proxy is not None:
@@ -82,7 +80,6 @@ class WebPage(Service):
         if keys is not None:
             _check_keys(*keys)
         self._clock = clock
-        self._recorded = recorded
         self._failures = failures or Failures(clock)
         self._socket = Awaited(lambda: _bound(host, port), _PART, self._failures)
         self._stop = threading.Event()
@@ -150,7 +147,7 @@ class WebPage(Service):
 
     def show(self, state: GroundState) -> None:
         """Give out how all edges are; for any thread."""
-        message, loads = state_message(state, recorded=self._recorded), state_loads(state)
+        message, loads = state_message(state), state_loads(state)
         known = frozenset(one.edge for one in state.edges)
         self._hub.post(lambda: self._hub.state(message, loads, known=known))
 

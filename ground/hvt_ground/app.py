@@ -95,7 +95,7 @@ class Ground:
         """
         config = self._config
         check_edge_pattern(config.edges)
-        check_outputs(config)
+        check_outputs(config, records=self._program is None)
         models = Models(config)
         with ExitStack() as stack:
             view: LiveView | None = None
@@ -204,6 +204,7 @@ class Ground:
             calibrated=models.facts.stills_calibrated,
             failures=models.failures,
             loading=lambda: models.loading,
+            recorded=factory.records,
             group=group,
         )
         while not self._stop.wait(_POLL_S):

@@ -147,7 +147,7 @@ class GroundConfig:
     @property
     def written(self) -> list[Written]:
         given = (
-            *(("--record", self.record or Path(), ".rrd"), ("--tracks", self.tracks, ".csv")),
+            *(("--record", self.record, ".rrd"), ("--tracks", self.tracks, ".csv")),
             *(
                 ("--stills", self.stills, ".csv"),
                 ("--timing", self.timing, ""),

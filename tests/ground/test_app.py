@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -22,7 +23,7 @@ from programs.outsider import joined
 from programs.processes import eventually
 
 
-def config(port: int, folder: Path, **changes: Any) -> GroundConfig:
+def config(port: int, folder: Path | None, **changes: Any) -> GroundConfig:
     """A light ground."""
     listen = (f"tcp/127.0.0.1:{port}",)
     return check(
@@ -35,10 +36,10 @@ def config(port: int, folder: Path, **changes: Any) -> GroundConfig:
 class Run:
     """A ground in a thread of its own."""
 
-    def __init__(self, settings: GroundConfig) -> None:
+    def __init__(self, settings: GroundConfig, **more: Any) -> None:
         self.started, self.stop = threading.Event(), threading.Event()
         self.sessions: list[dict[str, Any]] | None = None
-        self._ground = Ground(settings, stop=self.stop, on_started=self.started.set)
+        self._ground = Ground(settings, stop=self.stop, on_started=self.started.set, **more)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         assert self.started.wait(60)
@@ -111,13 +112,28 @@ class Brings(Extra):
     """An extra with one service."""
 
     def __init__(self, shown: str = "") -> None:
-        self._shown = shown
+        self.service = Service()
+        self.service.shown_to_others = shown
 
     def serve(self, *_: Any, **__: Any) -> Service:
         """One that others see there, or nowhere."""
-        service = Service()
-        service.shown_to_others = self._shown
-        return service
+        return self.service
+
+
+@pytest.mark.parametrize("program", [None, lambda _info: None])
+def test_it_records_where_it_is_started_and_says_so_unless_a_program_takes_all(
+    free_port: int, monkeypatch: pytest.MonkeyPatch, program: Any
+) -> None:
+    """NOT RECORDED stood beside recordings; a program was refused for a folder that it leaves alone."""
+    brings, states = Brings(), list[Any]()
+    monkeypatch.setattr(brings.service, "show", states.append)
+    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
+    monkeypatch.setattr(os, "access", lambda *_: program is None)
+    run = Run(config(free_port, None), program=program)
+    eventually(lambda: states, what="a state")
+    run.stop.set()
+    eventually(lambda: run.over, what="the ground has ended")
+    assert states[0].recorded == (program is None)
 
 
 def test_a_group_learns_of_the_page_whatever_else_is_served(

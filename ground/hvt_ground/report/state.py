@@ -227,6 +227,8 @@ class GroundState:
     """They are not open yet: video is recorded and shown, without boxes of this ground."""
     calibrated: bool
     """Whether a still's probability of a class is one: it was fitted to how often it is right."""
+    recorded: bool
+    """Sessions are, as far as nothing of it has failed."""
     edges: tuple[EdgeState, ...]
     member: str | None
     """This ground in its ``--group``; None without."""
@@ -254,6 +256,7 @@ class StateMaker:
     calibrated: bool = False
     failures: Failures | None = None
     loading: Callable[[], bool] = lambda: False
+    recorded: bool = True
     group: GroundGroup | None = None
 
     def __post_init__(self) -> None:
@@ -276,6 +279,7 @@ class StateMaker:
             classifier=self.classifier,
             loading=self.loading(),
             calibrated=self.calibrated,
+            recorded=self.recorded,
             edges=made,
             member=None if self.group is None else self.group.member,
             elsewhere={} if self.group is None else self.group.elsewhere,

@@ -40,8 +40,11 @@ from hvt_ground.sinks.rerun.rrd_file import locked
 _log = logging.getLogger(__name__)
 
 
-def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
-    """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`."""
+def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = (), records: bool = True) -> None:
+    """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`.
+
+    What ``records`` without ``--record`` does so here.
+    """
     given = (
         *(config.detector, config.classifier, config.labels, config.detector_labels),
         *(config.zenoh_config,),
@@ -51,7 +54,8 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
         reads += extra.reads(config)
     for extra in extras_of(config):
         extra.check_outputs(config)
-    for name, path, suffix in written(config):
+    here = [("--record", Path(), ".rrd")] if records and config.record is None else []
+    for name, path, suffix in (*written(config), *here):
         if is_file(path, suffix):
             check_writable(path, name=name, reads=reads)
         elif path.exists() and not path.is_dir():

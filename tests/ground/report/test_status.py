@@ -111,7 +111,7 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
         edge.session, still_outcomes=every, stills_not_sent=every, levers=levers, gaps=2, lost=3
     )
     state = replace(state, edges=(replace(edge, session=session),), failed=ground.failures.now)
-    shown = json.loads(state_message(state, recorded=True))["edges"]["uav-1"]
+    shown = json.loads(state_message(state))["edges"]["uav-1"]
     code = re.compile("|".join(word for word in STILL_WORDS if "_" in word))
     assert not code.search(json.dumps([shown[one] for one in ("words", "why", "short", "failed")]))
     assert all(re.fullmatch(r"[A-Z].*[^.]\.", one) for one in shown["why"]), shown["why"]
@@ -147,7 +147,7 @@ def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monke
     assert "refined  UNKNOWN VIEW" in ground.line()
     state = ground.maker.make([("uav-1", ground.sessions)])
     assert (state.edges[0].session.view_trust, state.edges[0].session.view_unlike) == (0.53, True)
-    shown = json.loads(state_message(state, recorded=True))["edges"]["uav-1"]
+    shown = json.loads(state_message(state))["edges"]["uav-1"]
     assert any(one.startswith("this view is unlike") for one in shown["words"])
     text = metrics_text(state).decode()
     assert 'hvt_view_trust_ratio{edge="uav-1"} 0.53' in text

@@ -38,7 +38,7 @@ def address() -> Iterator[str]:
     (port,) = free_ports(1)
     units = list(moving_square("libx265", 60))
     ended = threading.Event()
-    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns, recorded=False) as page:
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as page:
 
         def fly(edge: str, number: int, *, stops: bool) -> None:
             info = replace(
