@@ -72,7 +72,8 @@ class StaleSockets:
     that began in darkness has all of ``open_timeout``, even if the line is back: a tunnel or proxy on the way may
     have accepted it, and says nothing. So no socket lingers, and a handshake that hangs is shut down as soon as a
     probe that began after it was answered, and it was not: on a slow line the older has its answer first. The next
-    one has its full time, should the other side be slow.
+    one has its full time, should the other side be slow. Of a name with several addresses the first, where
+    it is dark, would take all of ``open_timeout`` each time: it is shut down as soon as another one answers.
 
     Other sockets of the process are none of its business, even where they are connected to the same place: Zenoh's
     have the send buffer that its configuration says. What is a link of any session here is no handshake.
@@ -85,7 +86,8 @@ class StaleSockets:
         self._session = session
         self._open_s = int(config.get_json("transport/unicast/open_timeout")) / 1000
         self._tables = [one for one in TCP_TABLES if one.exists()]
-        self._ports = {end_of(one).rpartition(":")[2] for one in connect_endpoints(config)}
+        self._places = {end_of(one) for one in connect_endpoints(config)}
+        self._ports = {one.rpartition(":")[2] for one in self._places}
         self._buffers = {_given_buffer(size) for size in _send_buffers(config)} if self._tables else set()
         self._known: dict[int, bool] = {}
         """Sockets of this process, and whether each is one of Zenoh's."""
@@ -96,6 +98,8 @@ class StaleSockets:
         self._probed_s: dict[str, float] = {}
         self._answered_s: dict[str, float] = {}
         """When the last probe of a place began that was answered."""
+        self._same_name: dict[str, list[str]] = {}
+        """The other addresses of a name, of a place that was probed."""
         self._spare_until_s = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-sockets", daemon=True)
@@ -142,12 +146,15 @@ class StaleSockets:
         for inode, theirs in pending.items():
             if now_s - max(self._pending_s[inode], self._probed_s.get(theirs, 0.0)) >= _HANGS_S:
                 self._probed_s[theirs] = now_s
-                threading.Thread(target=self._probe, args=[theirs], name="hvt-probe", daemon=True).start()
+                for look in (self._probe, self._probe_others):
+                    threading.Thread(target=look, args=[theirs], name="hvt-probe", daemon=True).start()
+        dark = [one for one, theirs in pending.items() if self._is_dark(own[one], one, theirs)]
         stale = [inode for inode, theirs in pending.items() if self._is_stale(own[inode], inode, theirs)]
         if stale and now_s > self._spare_until_s:
             self._spare_until_s = now_s + 2 * self._open_s  # the next begins after a pause
-            for inode in stale:
-                _shut_down(own[inode], inode)
+            dark += stale
+        for inode in dark:
+            _shut_down(own[inode], inode)
 
     def _zenohs(self) -> dict[int, int]:
         # Inode → descriptor. Each socket is looked at once: a host program may have thousands.
@@ -178,6 +185,23 @@ class StaleSockets:
     def _is_stale(self, fd: int, inode: int, theirs: str) -> bool:
         answered_s = self._answered_s.get(theirs, 0.0)
         return self._pending_s[inode] < answered_s and _received_s(fd, inode) < answered_s
+
+    def _is_dark(self, fd: int, inode: int, theirs: str) -> bool:
+        others_s = [self._answered_s.get(one, 0.0) for one in self._same_name.get(theirs, ())]
+        with suppress(OSError), same_socket(fd, inode) as one:
+            return _state(one) == _CONNECTS and self._pending_s[inode] < max(others_s, default=0.0)
+        return False
+
+    def _probe_others(self, theirs: str) -> None:
+        for place in self._places:
+            host, _, port = place.rpartition(":")
+            with suppress(OSError, UnicodeError):
+                found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
+                ends = {_end_of_name(one[4]) for one in found}
+                if theirs in ends:
+                    self._same_name[theirs] = sorted(ends - {theirs})
+        for one in self._same_name.get(theirs, ()):
+            threading.Thread(target=self._probe, args=[one], name="hvt-probe", daemon=True).start()
 
     def _probe(self, theirs: str) -> None:
         began_s = time.monotonic()

@@ -17,6 +17,7 @@ from pathlib import Path
 import json5
 import pytest
 
+from hvt_common.transport import stale_sockets
 from hvt_common.transport.session import open_session
 from hvt_common.transport.stale_sockets import TCP_TABLES, end_of, same_socket
 from hvt_common.transport.zenoh_config import LinkSettings
@@ -163,6 +164,25 @@ def test_a_handshake_begun_in_darkness_is_given_up_in_light(
         eventually(lambda: tunnel.in_vain)
         tunnel.lighten()
         eventually(edge.info.links, what="a link again")
+
+
+def test_a_name_whose_first_address_is_dark_has_others(
+    tmp_path: Path, free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With an IPv6 address that no packet reaches, an edge never came to the IPv4 address of the same name."""
+    file = tmp_path / "link.json5"
+    file.write_text(json.dumps({"transport": {"unicast": {"open_timeout": 1_000_000}}}))
+    found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (f"127.0.0.{one}", free_port)) for one in (1, 2)]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    ended: list[int] = []
+    monkeypatch.setattr(stale_sockets, "_shut_down", lambda *socket: ended.extend(socket))
+    with (
+        socket.create_server(("127.0.0.1", free_port), backlog=0),
+        socket.create_connection(("127.0.0.1", free_port)),  # from now on nobody is answered there
+        open_session(LinkSettings("ground", listen=(f"tcp/127.0.0.2:{free_port}",))),
+        open_session(LinkSettings("edge", connect=(f"tcp/127.0.0.1:{free_port}",), zenoh_config=file)),
+    ):
+        eventually(lambda: ended)
 
 
 def test_who_answers_slowly_is_waited_for(tmp_path: Path, free_port: int) -> None:
