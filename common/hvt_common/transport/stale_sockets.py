@@ -146,8 +146,8 @@ class StaleSockets:
         for inode, theirs in pending.items():
             if now_s - max(self._pending_s[inode], self._probed_s.get(theirs, 0.0)) >= _HANGS_S:
                 self._probed_s[theirs] = now_s
-                for look in (self._probe, self._probe_others):
-                    threading.Thread(target=look, args=[theirs], name="hvt-probe", daemon=True).start()
+                for probe in (self._probe, self._probe_others):
+                    threading.Thread(target=probe, args=[theirs], name="hvt-probe", daemon=True).start()
         dark = [one for one, theirs in pending.items() if self._is_dark(own[one], one, theirs)]
         stale = [inode for inode, theirs in pending.items() if self._is_stale(own[inode], inode, theirs)]
         if stale and now_s > self._spare_until_s:

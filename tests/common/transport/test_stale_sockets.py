@@ -17,7 +17,6 @@ from pathlib import Path
 import json5
 import pytest
 
-from hvt_common.transport import stale_sockets
 from hvt_common.transport.session import open_session
 from hvt_common.transport.stale_sockets import TCP_TABLES, end_of, same_socket
 from hvt_common.transport.zenoh_config import LinkSettings
@@ -175,7 +174,7 @@ def test_a_name_whose_first_address_is_dark_has_others(
     found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (f"127.0.0.{one}", free_port)) for one in (1, 2)]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
     ended: list[int] = []
-    monkeypatch.setattr(stale_sockets, "_shut_down", lambda *socket: ended.extend(socket))
+    monkeypatch.setattr(socket.socket, "shutdown", lambda *_: ended.append(1))
     with (
         socket.create_server(("127.0.0.1", free_port), backlog=0),
         socket.create_connection(("127.0.0.1", free_port)),  # from now on nobody is answered there
