@@ -104,6 +104,8 @@ Anchor = Literal["top-left", "centre", "stretch"]
 """Where the resized image lies on the network's input; ``stretch`` fills it, whatever becomes of the shape."""
 
 _FILL = 114  # the grey of YOLO letterboxes
+_ROWS_AT_ONCE = 128
+"""The planes of so many rows stay in the cache, and take no memory beside the picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +173,7 @@ class Letterboxer:
         self._input_size = (0, 0)
         self._letterbox: Letterbox | None = None
         self._resized: Image
-        self._planes: list[npt.NDArray[np.uint8]]
+        self._planes: Image
         self._tensor: npt.NDArray[Any]
         self._last: npt.NDArray[Any]
 
@@ -192,11 +194,13 @@ class Letterboxer:
         if content != image_size:
             cv2.resize(image_bgr, content, dst=self._resized, interpolation=cv2.INTER_LINEAR)
             image_bgr = self._resized
-        planes = cv2.split(image_bgr, self._planes)  # a tenth of the time of one channel after the other
-        if self._rgb:
-            planes = planes[::-1]
-        for plane, table, target in zip(planes, self._tables, self._targets, strict=True):
-            cv2.LUT(plane, table, dst=target)
+        for top in range(0, len(image_bgr), _ROWS_AT_ONCE):
+            rows = image_bgr[top : top + _ROWS_AT_ONCE]
+            planes = list(self._planes[:, : len(rows)])
+            cv2.split(rows, planes)  # a tenth of the time of one channel after the other
+            ordered = planes[::-1] if self._rgb else planes
+            for plane, table, target in zip(ordered, self._tables, self._targets, strict=True):
+                cv2.LUT(plane, table, dst=target[top : top + len(rows)])
         if not self._channels_last:
             return self._tensor, self._letterbox
         np.copyto(self._last, self._tensor.transpose(0, 2, 3, 1))
@@ -206,13 +210,12 @@ class Letterboxer:
         self._letterbox = Letterbox.fitted(image_size, input_size, anchor=self._anchor)
         self._input_size = input_size
         # The former input goes before the new one comes: 25 MB for a 1080p source.
-        self._resized = self._tensor = self._last = np.empty(0, np.uint8)
-        self._planes = []
+        self._resized = self._planes = self._tensor = self._last = np.empty(0, np.uint8)
         self._targets: list[npt.NDArray[Any]] = []
         left, top, wide, high = self._letterbox.content
         width, height = input_size
         self._resized = np.empty((0 if (wide, high) == image_size else high, wide, 3), np.uint8)
-        self._planes = [np.empty((high, wide), np.uint8) for _ in range(3)]
+        self._planes = np.empty((3, min(high, _ROWS_AT_ONCE), wide), np.uint8)
         self._tensor = np.empty((1, 3, height, width), self._dtype)
         for plane, table in zip(_bits(self._tensor)[0], self._tables, strict=True):
             plane[:] = table[_FILL]

@@ -189,10 +189,10 @@ def test_a_picture_that_fits_is_not_copied_whole():
     """A 1080p picture took 6 MB more for as long as the detector was there."""
     preparation = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3)
     boxer = Letterboxer(anchor="top-left", preparation=preparation, dtype=np.dtype(np.float32))
-    picture = np.zeros((250, 256, 3), np.uint8)
+    picture = np.zeros((1000, 256, 3), np.uint8)
     tracemalloc.start()
     try:
-        tensor, _ = boxer.fill(picture, (256, 256))
+        tensor, _ = boxer.fill(picture, (256, 1024))
         held = tracemalloc.get_traced_memory()[0]
     finally:
         tracemalloc.stop()
