@@ -46,7 +46,7 @@ class Preparation:
         rgb = (self.rgb if own.rgb is None else own.rgb) != own.turned
         if own.top is not None:
             return Preparation((0.0,) * 3, (own.top / 255,) * 3, rgb=rgb)
-        step = -1 if own.turned else 1
+        step = 1 if rgb == self.rgb else -1
         (red, green, blue), (of_red, of_green, of_blue) = self.mean[::step], self.scale[::step]
         return Preparation((red, green, blue), (of_red, of_green, of_blue), rgb=rgb)
 
@@ -73,12 +73,13 @@ def prepared_as(
         raise UserError(
             f"model {path} has hvt.channel_order '{order}' in its metadata; RGB or BGR is accepted"
         )
+    usual = usual.beside(OwnSteps(rgb=order == "RGB"))
     if dtype == np.uint8:
-        return Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=order == "RGB")
+        return Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=usual.rgb)
     return Preparation(
         mean=_three_numbers(path, metadata, "hvt.mean", usual.mean),
         scale=_three_numbers(path, metadata, "hvt.scale", usual.scale),
-        rgb=order == "RGB",
+        rgb=usual.rgb,
     )
 
 

@@ -175,7 +175,7 @@ class ChunkAllowance:
 
     limit_bytes: int
     trickle: bool = False
-    """There is no room, or live stills are pending: a little goes all the same, with pauses."""
+    """There is no room: a little goes all the same, with pauses."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,11 @@ def scores(path: Path, crop: np.ndarray) -> np.ndarray:
     [
         (1001, {}, (np.array([50, 100, 200]) - 128) / 128),
         (1000, {}, (np.array([50, 100, 200]) / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]),
+        (
+            1000,
+            {"hvt.channel_order": "BGR"},
+            (np.array([200, 100, 50]) / 255 - [0.406, 0.456, 0.485]) / [0.225, 0.224, 0.229],
+        ),
         (9, {"author": "Ultralytics", "task": "classify"}, np.array([50, 100, 200]) / 255),
         (9, {"task": "classify"}, np.array([50, 100, 200]) / 255),
         (7, {"hvt.mean": "1, 2, 3", "hvt.scale": "(0.01)"}, (np.array([50, 100, 200]) - [1, 2, 3]) / 100),
