@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from hvt_study.metrics.bits import in_accounting
-from hvt_study.report.data.arms import RunRow, Setting, counts, sequence_of, settings
+from hvt_study.report.data.arms import RunRow, Setting, clip_of, counts, sequence_of, settings
 from hvt_study.report.data.captions import ENOUGH, METRICS, time_of, written
 from hvt_study.report.data.document import Drawing, Part, Report, Section, Table
 from hvt_study.report.data.pairs import Pair, equal_quality, pairs
@@ -113,7 +113,8 @@ def make_report(
 
 def _lead(rows: Sequence[RunRow]) -> Iterator[str]:
     good = sum(map(counts, rows))
-    sequences = len({(row["dataset"], row["sequence"]) for row in rows})
+    clips, names = (len(set(map(name, rows))) for name in (clip_of, sequence_of))
+    sequences = min(clips, names)
     span_s = sum(row["duration_s"] or 0 for row in rows if counts(row))
     bad = len(rows) - good
     strays = _strays(rows)
@@ -123,6 +124,8 @@ def _lead(rows: Sequence[RunRow]) -> Iterator[str]:
         f"count; {bad or 'none'} failed or missed the total to be matched. Rates are of every byte that crosses the "
         f"line, over the {time_of(accounting)}, unless a table says otherwise."
     )
+    if names > clips:
+        yield f"Some have several names ({names} in all, for the very same pictures and labels), and count once."
     if strays:
         yield (
             f"{_many(strays, 'run')} of video {'was' if strays == 1 else 'were'} coded to the total of a run that is "
@@ -138,13 +141,17 @@ def _lead(rows: Sequence[RunRow]) -> Iterator[str]:
 def _strays(rows: Sequence[RunRow]) -> int:
     """Followers that count and are in no pair, as in tables that were joined."""
     paired = {
-        (name, row["key"])
+        _flight_of(row)
         for setting in settings(rows)
         for pair in pairs(setting)
-        for name, row in pair.matched.items()
+        for row in pair.matched.values()
     }
     matching = [row for row in rows if counts(row) and row["matched_to"]]
-    return sum((sequence_of(row), row["key"]) not in paired for row in matching)
+    return sum(_flight_of(row) not in paired for row in matching)
+
+
+def _flight_of(row: RunRow) -> tuple[str, str, int]:
+    return clip_of(row), row["digest"], row["target_bps"]
 
 
 def _many(count: int, what: str) -> str:

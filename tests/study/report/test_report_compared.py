@@ -178,8 +178,8 @@ def test_a_follower_of_another_total_is_no_match():
 
 def test_no_verdict_is_drawn_from_few_sequences():
     """Of two sequences an interval is their range, and leaves out 0 half of the time where nothing is to be found."""
-    few = make_report(many(4))
-    (text,) = [part for part in few.sections[0].parts if isinstance(part, str)]
+    few = make_report([*many(4), *many(4, dataset="demo:0-3")])  # the same four under another name
+    text = few.sections[0].parts[0]
     assert "+0.100 named F1 (n = 4)" in text
     assert "That is no verdict: 1 pair of method and regime has fewer than 5 sequences" in text
     enough = make_report(many(5))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 from hvt_study.report.data.document import Table
 from hvt_study.runs.spec import COLUMNS
 
@@ -30,6 +32,8 @@ def row(sequence, method, total_bps, named_f1=None, **own):
         "total_bps": total_bps,
         "named_f1": named_f1,
     }
+    scheme, _, _ = own.get("dataset", filled["dataset"]).partition(":")
+    filled["content"] = json.dumps({"clip": f"{scheme} {sequence}"})  # whatever else the dataset holds
     assert set(own) <= set(filled), "only columns of the table"
     return filled | own
 

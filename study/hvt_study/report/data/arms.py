@@ -132,6 +132,8 @@ class Arm:
 class Setting:
     """Runs that may be averaged: same labels, same networks, same conditions, over one dataset or several.
 
+    A sequence that is there under several names (``demo:0-4`` and ``demo:0-9``, the three copies of MOT17) is one.
+
     Raises `UserError` where two different runs count at one place, so that none of them is the one.
     """
 
@@ -145,20 +147,29 @@ class Setting:
         init=False, repr=False, compare=False
     )
     """By whose they are and by sequence; of followers one a target."""
+    _names: Mapping[str, str] = field(init=False, repr=False, compare=False)
+    """Of sequences by `clip_of`: the first that each has in the table."""
 
     def __post_init__(self) -> None:
+        names: dict[str, str] = {}
+        for row in self.rows:
+            names.setdefault(clip_of(row), sequence_of(row))
+        object.__setattr__(self, "_names", names)
         counted: dict[tuple[str, ...], dict[str, tuple[RunRow, ...]]] = {}
         places: dict[tuple[Any, ...], RunRow] = {}
-        for row in sorted(filter(counts, self.rows), key=sequence_of):
-            whose, name = tuple(row[column] for column in _WHOSE), sequence_of(row)
+        for row in sorted(filter(counts, self.rows), key=self._name):
+            whose, name = tuple(row[column] for column in _WHOSE), self._name(row)
             first = places.setdefault((whose, name, row["target_bps"]), row)
             if first is row:
                 of = counted.setdefault(whose, {})
                 of[name] = (*of.get(name, ()), row)
-            elif first["key"] != row["key"]:
+            elif first["key"] != row["key"] and sequence_of(first) == sequence_of(row):
                 raise UserError(_conflict(first, row))
         _one_tune_a_method(self.rows)
         object.__setattr__(self, "_counted", counted)
+
+    def _name(self, row: RunRow) -> str:
+        return self._names[clip_of(row)]
 
     @property
     def name(self) -> str:
@@ -168,7 +179,7 @@ class Setting:
     @property
     def sequences(self) -> int:
         """How many there are, whether or not their runs count."""
-        return len({sequence_of(row) for row in self.rows})
+        return len(set(self._names.values()))
 
     @property
     def tunes(self) -> Mapping[str, tuple[str, ...]]:
@@ -229,7 +240,7 @@ class Setting:
         found: dict[str, list[RunRow]] = {}
         for row in self.rows:
             if row["method"] == reference and counts(row):
-                found.setdefault(sequence_of(row), []).append(row)
+                found.setdefault(self._name(row), []).append(row)
         return found
 
 
@@ -275,8 +286,18 @@ def place(dataset: str) -> str:
 
 
 def sequence_of(row: RunRow) -> str:
-    """Dataset and name: what runs are paired by."""
+    """Dataset and name."""
     return f"{row['dataset']}#{row['sequence']}"
+
+
+def clip_of(row: RunRow) -> str:
+    """Names pictures and labels by their content, under whatever name; by that where a row does not say it."""
+    return _clip(row["content"]) or sequence_of(row)
+
+
+@lru_cache(maxsize=100_000)
+def _clip(content: str) -> str:
+    return str(table_of(content).get("clip") or "")
 
 
 def _order(method: str) -> tuple[int, str]:
