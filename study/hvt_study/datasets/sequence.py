@@ -96,14 +96,13 @@ class FrameSource(Source):
                 yield self._resizer.frame(np.asarray(image), index=index, capture_ns=capture_ns)
 
 
-def stage_clip(clip: Clip, *, folder: Path) -> Clip:
-    """The clip with its pixels in a file in ``folder``, which is there, so that every flight need not decode or draw.
+def stage_clip(clip: Clip, path: Path) -> Clip:
+    """The clip with its pixels in a file of this path, so that every flight need not decode or draw.
 
-    The very same clip where it is large (over 4 GiB), or the disk is full; nothing is left behind then.
+    The very same clip where it is large (over 4 GiB), or the disk is full: the file is of no use then.
     """
     if not staged_bytes(clip):
         return clip
-    path = folder / "clip.bgr"
     count = 0
     try:
         with path.open("wb") as file, closing(clip.images()) as images:
@@ -111,12 +110,8 @@ def stage_clip(clip: Clip, *, folder: Path) -> Clip:
                 file.write(np.ascontiguousarray(image).data)
                 count += 1
     except OSError:
-        path.unlink(missing_ok=True)
         return clip
-    if not count:
-        path.unlink()
-        return clip
-    return replace(clip, pixels=path, frame_count=min(count, clip.frame_count))
+    return replace(clip, pixels=path, frame_count=min(count, clip.frame_count)) if count else clip
 
 
 def staged_bytes(clip: Clip) -> int:

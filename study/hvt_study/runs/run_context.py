@@ -174,7 +174,7 @@ def open_run_context(spec: RunSpec, *, cache: Path) -> RunContext:
 def _open(spec: RunSpec, cache: Path) -> RunContext:
     cv2.setNumThreads(1)  # there are as many processes as cores to use
     found = open_materials(spec, cache=cache)
-    clip, pictures = _staged(found.sequence.clip)
+    clip, pictures = open_pixels(found.sequence.clip)
     sequence = replace(found.sequence, clip=clip)
     if spec.labels == "reference":
         sequence = _with_reference(sequence, found, cache, base_size=spec.size)
@@ -183,31 +183,33 @@ def _open(spec: RunSpec, cache: Path) -> RunContext:
     return RunContext(**own, labels=tuple(one for one in truth if one is not None), pictures=pictures)
 
 
-def _staged(clip: Clip) -> tuple[Clip, object]:
+def open_pixels(clip: Clip) -> tuple[Clip, object]:
     """The clip with its pixels in a file, if there is room, and what keeps that file.
 
-    Where the system allows it the file has no name any more: it is gone with the process, however that ends.
+    Where the system allows it the file has no name from the first pixel on: it is gone with the process, whenever and
+    however that ends.
     """
     try:
-        folder = tempfile.TemporaryDirectory(prefix="hvt-study-")
+        keeper: object = (folder := tempfile.TemporaryDirectory(prefix="hvt-study-"))
+        path = Path(folder.name) / "clip.bgr"
+        if _OPEN_FILES.is_dir():
+            keeper = (file := _OpenFile(path))
+            folder.cleanup()
+            path = file.path
     except OSError as error:
         where = tempfile.tempdir or "no folder for temporary files"  # None where each refuses
         raise UserError(
             f"{where} takes no files ({error.strerror}): make room, or name another with TMPDIR"
         ) from None
-    staged = stage_clip(clip, folder=Path(folder.name))
-    if staged.pixels is not None and not _OPEN_FILES.is_dir():
-        return staged, folder
-    pixels = None if staged.pixels is None else _OpenFile(staged.pixels)
-    folder.cleanup()
-    return (staged, None) if pixels is None else (replace(staged, pixels=pixels.path), pixels)
+    staged = stage_clip(clip, path)
+    return staged, None if staged.pixels is None else keeper
 
 
 class _OpenFile:
-    """A file that is there as long as this object is, whatever becomes of its name."""
+    """A new file that is there as long as this object is, whatever becomes of its name."""
 
     def __init__(self, path: Path) -> None:
-        number = os.open(path, os.O_RDONLY)
+        number = os.open(path, os.O_RDWR | os.O_CREAT)
         self.path = _OPEN_FILES / str(number)
         weakref.finalize(self, os.close, number)
 

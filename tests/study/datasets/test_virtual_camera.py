@@ -75,7 +75,7 @@ def test_regions_without_labels_are_known(picture):
 def test_shared_once_for_all(picture, tmp_path):
     """Processes must fly over the very same pixels."""
     (sequence,) = open_dataset(f"still:{picture}")
-    clip = stage_clip(sequence.limited(4).clip, folder=tmp_path)
+    clip = stage_clip(sequence.limited(4).clip, tmp_path / "clip.bgr")
     assert clip.pixels is not None
     images = list(clip.images())
     again = VirtualCamera(picture).images()
