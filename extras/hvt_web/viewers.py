@@ -124,6 +124,7 @@ class Viewer:
 
     async def take(self) -> str | bytes:
         """The next message. Raises `ConnectionError` where the viewer is hopeless."""
+        await asyncio.sleep(0)  # else all goes to a connection that is lost, and asyncio warns of each
         while not self._queue and not self.hopeless:
             self._there.clear()
             await self._there.wait()

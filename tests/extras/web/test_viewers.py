@@ -166,6 +166,21 @@ def test_who_takes_nothing_at_all_is_given_up():
         asyncio.run(viewer.take())
 
 
+def test_that_a_viewer_has_gone_is_heard_between_two_messages():
+    """Each tab that was closed on a weak radio left up to 300 lines of warnings in the log of the ground."""
+    viewer, heard = Viewer(), []
+    viewer.put("words")
+    viewer.put("words")
+
+    async def sent() -> None:
+        await viewer.take()
+        asyncio.get_running_loop().call_soon(heard.append, "lost")
+        await viewer.take()
+        assert heard == ["lost"]
+
+    asyncio.run(sent())
+
+
 def test_few_long_words_are_too_much_too():
     """Sixty viewers that hang would take gigabytes, two thousand messages each."""
     viewer = Viewer()
