@@ -29,8 +29,7 @@ _MOST_PICTURES = 4 * _MOST_STILLS
 """A still has two; those of the list are there while as many newer stills come, for a slow browser asks late."""
 _MOST_STILL_BYTES = 24 * 2**20
 _MOST_NOTICES = 100
-_MOST_LOADS = 240
-"""One a second."""
+_MOST_LOADS = 240  # one a second
 
 
 def text(kind: str, **content: Any) -> str:
@@ -195,9 +194,11 @@ class EdgePage:
         self.notices: deque[str] = deque(maxlen=_MOST_NOTICES)
         self.pictures = StillPictures()
         self.thumbnail: bytes | None = None
+        self.overlay = ""  # the last boxes: of a silent edge no others come
         self.wanted: Mapping[Rung, int] = {}
         """Read by the thread that makes them; another number is another stream, which begins with a start."""
         self.streams: dict[Rung, _Stream] = {}
+        """Kept when nobody looks any more: of an edge that is silent nothing else comes for who looks again."""
 
 
 class Hub:
@@ -253,7 +254,7 @@ class Hub:
             for viewer in self._watching(edge, rung):
                 viewer.leave_video()
                 self._put_thumbnails(viewer)
-                self._join_stream(viewer, stream)
+                self._join_stream(viewer, edge, rung)
         elif isinstance(item, Fragment):
             self._fragment(edge, rung, item, about)
         else:
@@ -262,17 +263,16 @@ class Hub:
                 viewer.put_video(message, begins=True)
 
     def overlay(self, edge: EdgePage, message: str) -> None:
-        for viewer in self.viewers:
-            if viewer.watches and viewer.watches[0] == edge.edge:
-                viewer.put_video(message, begins=False)
+        edge.overlay = message
+        for viewer in self._watching(edge):
+            viewer.put_video(message, begins=False)
 
     def still(self, edge: EdgePage, message: str, pictures: list[tuple[str, str, bytes, str]]) -> None:
         for still, which, picture, media_type in pictures:
             edge.pictures.add(still, which, picture, media_type)
         edge.stills.append(message)
-        for viewer in self.viewers:
-            if viewer.watches and viewer.watches[0] == edge.edge:
-                viewer.put(message)
+        for viewer in self._watching(edge):
+            viewer.put(message)
 
     def notice(self, edge: EdgePage, message: str) -> None:
         """An event; the wall shows the last one of each edge."""
@@ -321,7 +321,7 @@ class Hub:
         if edge is not None:
             for message in (*edge.notices, *edge.stills):
                 viewer.put(message)
-            self._join_stream(viewer, edge.streams.get(rung))
+            self._join_stream(viewer, edge, rung)
         self._want_all()
 
     def leave_edge(self, viewer: Viewer) -> None:
@@ -344,12 +344,15 @@ class Hub:
             if edge.thumbnail is not None:
                 viewer.put_picture(edge.thumbnail)
 
-    def _join_stream(self, viewer: Viewer, stream: _Stream | None) -> None:
+    def _join_stream(self, viewer: Viewer, edge: EdgePage, rung: Rung) -> None:
+        stream = edge.streams.get(rung)
         if stream is None or stream.start is None:
             return
         for one in stream.start:
             viewer.put(one)
         viewer.begin_video(stream.fragments)
+        if edge.overlay:
+            viewer.put_video(edge.overlay, begins=False)
 
     def _fragment(self, edge: EdgePage, rung: Rung, item: Fragment, about: dict[str, Any]) -> None:
         stream = edge.streams.get(rung)
@@ -377,8 +380,9 @@ class Hub:
         for viewer in self._watching(edge, rung):
             viewer.put_video(message, begins=item.keyframe)
 
-    def _watching(self, edge: EdgePage, rung: Rung) -> list[Viewer]:
-        return [one for one in self.viewers if one.watches == (edge.edge, rung)]
+    def _watching(self, edge: EdgePage, *rungs: Rung) -> list[Viewer]:
+        shown = [(edge.edge, rung) for rung in rungs or RUNGS]
+        return [one for one in self.viewers if one.watches in shown]
 
     def _to_all(self, message: str) -> None:
         for viewer in self.viewers:
@@ -394,5 +398,3 @@ class Hub:
             wanted.add(THUMBNAIL)
         self._demands += 1
         edge.wanted = {rung: edge.wanted.get(rung, self._demands) for rung in wanted}
-        for rung in [rung for rung in edge.streams if rung not in wanted]:
-            del edge.streams[rung]  # it begins anew with the next one who looks
