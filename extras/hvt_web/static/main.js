@@ -22,7 +22,7 @@ const by = (id) => document.getElementById(id);
 /** @type {Map<string, Message>} */
 const sessions = new Map();
 /**
- * How each edge is, by the newest state.
+ * How each edge is, by the newest state; empty where that is old.
  * @type {Map<string, Message>}
  */
 const states = new Map();
@@ -68,8 +68,7 @@ function onState(state, why) {
   showAge();
   by("connection").textContent = words.connectionWords(connected, why);
   by("connection").classList.toggle("bad", !connected);
-  if (state !== "connected") return;
-  if (chosen) watch();
+  if (connected && chosen) watch();
   connection.send({ type: "wall", shown: true });
 }
 
@@ -187,8 +186,7 @@ function forgetEvents() {
 }
 
 function watch() {
-  player.reset();
-  boxes.reset();
+  player.reset(); // the last picture stays, with its boxes
   forgetEvents();
   connection.send({ type: "watch", edge: chosen, rung: rungs[0] });
   by("rung").textContent = words.RUNG_WORDS[rungs[0]];
@@ -275,11 +273,11 @@ function showBehind() {
 }
 
 setInterval(() => {
-  const told = connected && performance.now() - stateAt < STATE_OLD_MS;
-  wall.tick(connection.now(), told);
+  if (!connected || performance.now() - stateAt >= STATE_OLD_MS) states.clear();
+  wall.refresh(connection.now(), states);
   if (performance.now() - tracksAt > 1000) listTracks();
-  by("commands").disabled = !told || states.get(chosen)?.link === "ended";
-  if (told) return;
+  by("commands").disabled = (states.get(chosen)?.link ?? "ended") === "ended";
+  if (states.has(chosen)) return;
   plot.tick(connection.now());
   if (by("link-text").textContent) by("link-text").textContent = words.UNKNOWN_LINK;
   by("failed").textContent = "";
@@ -461,6 +459,7 @@ by("show-boxes").addEventListener("click", () => boxes.toggle(pressed(by("show-b
 /** @param {Message} message */
 function onGroundState(message) {
   stateAt = performance.now();
+  states.clear(); // an edge that is not in it may have ended while the ground was away
   wall.elsewhere(message.elsewhere);
   for (const [edge, state] of Object.entries(message.edges)) {
     wall.state(edge, state, message.at);

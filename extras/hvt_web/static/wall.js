@@ -92,15 +92,15 @@ export class Wall {
 
   /**
    * About once a second: what is not live looks so, and says how old it is.
-   * @param {number} now @param {boolean} connected whether the ground tells how the edges are
+   * @param {number} now @param {{has: (edge: string) => boolean}} known the edges of which the ground tells how they are
    */
-  tick(now, connected) {
-    for (const card of this.cards.values()) {
+  refresh(now, known) {
+    for (const [edge, card] of this.cards) {
       const age = now - card.captured;
-      const old = !connected || card.link === "lost" || card.link === "ended" || age > OLD_MS;
+      const old = !known.has(edge) || card.link === "lost" || card.link === "ended" || age > OLD_MS;
       card.button.classList.toggle("old", old);
       card.age.textContent = card.captured && old ? words.oldWords(age) : "";
-      if (connected) continue;
+      if (known.has(edge)) continue;
       card.light.dataset.state = "unknown";
       card.state.textContent = words.UNKNOWN_CARD;
       card.bar.hidden = true;
