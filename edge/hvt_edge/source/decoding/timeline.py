@@ -83,6 +83,8 @@ class Timeline:
         self._stamp_s: Fraction | None = None
         self._at_s: Fraction | None = None
         self._offset_s = Fraction(0)
+        self._former_s: Fraction | None = None
+        """That of before the last jump."""
         self.jumps: list[tuple[Fraction, Fraction]] = []
         """Place of each repair in the presentation, and the size of the step; seconds."""
 
@@ -115,9 +117,11 @@ class Timeline:
         if self._stamp_s is None:  # the first that is stamped
             self._offset_s = expected_s - stamp_s
             return expected_s
-        step_s = stamp_s - self._stamp_s
-        if step_s > self._most_s or step_s < -_LONG_STEPS * self._period_s:
+        step_s, near_s = stamp_s - self._stamp_s, _LONG_STEPS * self._period_s
+        if step_s > self._most_s or step_s < -near_s:
             self.jumps.append((self._at_s, step_s))
-            self._offset_s = expected_s - stamp_s
+            self._former_s, self._offset_s = self._offset_s, expected_s - stamp_s
+        elif self._former_s is not None and step_s > near_s >= abs(stamp_s + self._former_s - expected_s):
+            self._offset_s = self._former_s  # those between came late: around damage, or by damaged stamps
         at_s = stamp_s + self._offset_s
         return at_s if at_s > self._at_s else self._at_s + self._period_s / 2

@@ -31,8 +31,14 @@ def times(stamps):
         ([0, None, None, 3], [0, 1, 2, 3]),
         ([None, None, 7, 8], [0, 1, 2, 3]),
         ([0, 200, 201], [0, 200, 201]),
+        ([60, 61, 30, 31, 64, 65], [60, 61, 62, 63, 64, 65]),
+        ([31, 62, 63, 32, 64, 65], [31, 62, 63, 64, Fraction(129, 2), 65]),
+        ([60, 61, 30, 31, 52, 53], [60, 61, 62, 63, 84, 85]),
     ],
-    ids=["plain", "late", "two late", "anew", "twice", "unsaid", "late first", "a pause of seven seconds"],
+    ids=[
+        *("plain", "late", "two late", "anew", "twice", "unsaid", "late first", "a pause of seven seconds"),
+        *("early", "behind damage", "anew, and a pause"),
+    ],
 )
 def test_each_frame_comes_once_where_a_player_shows_it(stamps, shown):
     """One wrong stamp would repeat a picture for hours, or a recording be lost up to where its clock began anew."""
