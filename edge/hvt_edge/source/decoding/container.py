@@ -244,7 +244,7 @@ class _Reading:
     def __init__(self, container: Any, stream: Any) -> None:
         self._container, self._stream = container, stream
         self._size = _size_of(container)
-        self._damaged = self._shown_damaged = self._count = 0
+        self._damaged = self._shown_damaged = self._count = self._lossy = 0
         self._ended = ""
         self._end_s: Fraction | None = None
         self._end_byte = 0
@@ -255,6 +255,7 @@ class _Reading:
                 self._ended = f"it breaks off ({cause_of(packet)})"
             else:
                 self._count += bool(packet.size)  # what an edit list hides is there too
+                self._lossy += packet.is_corrupt and self._container.format.name == "mpegts"
                 self._end_byte = max(self._end_byte, (packet.pos or 0) + packet.size)
                 # By its own time: of decoding, the last of B-frames lies whole frames before it.
                 stamp = packet.dts if packet.pts is None else packet.pts
@@ -274,6 +275,8 @@ class _Reading:
             yield f"has {self._damaged} damaged packets, which were skipped"
         if self._shown_damaged:
             yield f"has {self._shown_damaged} damaged pictures, shown as the decoder has patched them"
+        if self._lossy:
+            yield f"lacks packets at {self._lossy} pictures: they were lost, or recordings were put together"
         why = self._ended or self._unfinished()
         if why:
             yield f"is unfinished: {why}"
@@ -335,11 +338,8 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
     while True:
         try:
             packet = next(packets)
-        except (
-            StopIteration,
-            IndexError,
-        ):  # the second where another stream began: PyAV has none of its number
-            return
+        except (StopIteration, IndexError):
+            return  # the second where another stream began: PyAV has none of its number
         except av.error.FFmpegError as error:
             yield error
             return

@@ -77,6 +77,15 @@ def test_a_recording_behind_the_film_is_said(tmp_path, caplog, ending, options):
     assert "hold nothing of this film, but perhaps another recording" in caplog.text
 
 
+def test_packets_that_a_recorder_lost_are_said(tmp_path, caplog):
+    """H.264 over a gap is smeared up to its next keyframe, and no picture of it is marked as damaged."""
+    write(tmp_path / "a.ts", range(30), group=30)
+    data = (tmp_path / "a.ts").read_bytes()
+    (tmp_path / "a.ts").write_bytes(data[: 188 * 30] + data[188 * 35 :])
+    play(tmp_path / "a.ts")
+    assert "a.ts lacks packets at 1 pictures" in caplog.text
+
+
 @pytest.mark.parametrize("source", [".", "0.tiff"])
 def test_of_a_file_of_many_pictures_it_is_said_that_one_is_shown(tmp_path, source):
     """A thermal recording of minutes, in one TIFF, was one picture, without a word."""
