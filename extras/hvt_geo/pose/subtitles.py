@@ -36,6 +36,8 @@ _DJI = {
     "dzoom_ratio": "zoom",
 }
 """Names in the subtitles; ``longtitude`` is how some models spell it."""
+_IN_PARTS = {"focal_len": (200, 10), "dzoom_ratio": (200, 10_000)}
+"""A whole number beyond the first counts so many parts: 240 is 24 mm, and 480.00 a lens of 480 mm."""
 _MOST_LATITUDE = 90.0
 _MOST_SATELLITES = 60
 
@@ -79,10 +81,11 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
             row |= {name: value for name, (value, _) in zip(angle_names, values, strict=True)}
     for name, said, feet in _NAMED.findall(body):
         if name.lower() in _DJI:
-            row[_DJI[name.lower()]] = _value(said, feet=feet)
+            least, parts = _IN_PARTS.get(name.lower(), (0, 1))
+            value = _value(said, feet=feet)
+            row[_DJI[name.lower()]] = value / parts if said.isdecimal() and value > least else value
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
-        focal_mm = focal_mm / 10 if focal_mm > 200 else focal_mm  # some models write tenths: 240 is 24 mm
         row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
     pitch = row.get("camera_pitch_deg", 0.0)
     if 90 < abs(pitch) <= _OVERSHOT_DEG:

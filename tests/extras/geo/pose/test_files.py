@@ -49,33 +49,34 @@ def at(path: Path, seconds: float, *, hfov_deg: float | None = None):
     return read_poses(path, hfov_deg=hfov_deg).at(round(seconds * SECOND_NS), capture_ns=7)
 
 
-def test_subtitles_of_a_drone_give_place_height_gimbal_and_zoom(tmp_path):
+def test_subtitles_of_a_drone_give_place_height_and_gimbal(tmp_path):
     """The file beside most drone clips would have to be turned into a table first."""
-    file = tmp_path / "DJI_0001.SRT"
-    file.write_text(MINI, encoding="utf-8")
-    pose = at(file, 0.5)
+    (tmp_path / "DJI_0001.SRT").write_text(MINI, encoding="utf-8")
+    pose = at(tmp_path / "DJI_0001.SRT", 0.5)
     assert pose.capture_ns == 7
     assert (pose.latitude_deg, pose.longitude_deg) == pytest.approx((47.37695, 8.5418))
     assert (pose.height_m, pose.altitude_m) == pytest.approx((81.1, 521.3))
     assert pose.camera.yaw_deg == pytest.approx(357.5)  # half way from -12.5 to 7.5
     assert pose.camera.pitch_deg == pytest.approx(-46)
-    assert pose.hfov_deg == pytest.approx(2 * math.degrees(math.atan(18 / 24)))
     assert pose.platform is None
 
 
-@pytest.mark.parametrize(("said", "means"), [("-90.4", -90), ("-92.0", -90), ("90.1", 90)])
-def test_a_gimbal_a_little_beyond_straight_down_points_straight_down(tmp_path, said, means):
-    """The noise of one frame would have the whole flight refused."""
-    file = tmp_path / "DJI_0001.SRT"
-    file.write_text(MINI.replace("gb_pitch: -45.0", f"gb_pitch: {said}"), encoding="utf-8")
-    assert at(file, 0.0).camera.pitch_deg == means
-
-
-def test_subtitles_with_a_long_word_are_read_as_any_others(tmp_path):
-    """A damaged file would hold the start for hours."""
-    file = tmp_path / "DJI_0001.SRT"
-    file.write_text(MINI.replace("[iso: 100]", "a" * 300_000), encoding="utf-8")
-    assert at(file, 0.0).latitude_deg == 47.3769
+@pytest.mark.parametrize(
+    ("written", "instead", "pitch", "focal_mm"),
+    [
+        *(("-45.0", said, means, 24) for said, means in (("-90.4", -90), ("-92.0", -90), ("90.1", 90))),
+        ("[iso: 100]", "a" * 300_000, -45, 24),
+        *(("24.00", said, -45, mm) for said, mm in (("240] [dzoom_ratio: 10000", 24), ("480.00", 480))),
+    ],
+)
+def test_subtitles_say_what_the_camera_sees(tmp_path, written, instead, pitch, focal_mm):
+    """The noise of a frame had a flight refused, a long word held it up, a long lens saw ten times as wide."""
+    (tmp_path / "a.SRT").write_text(MINI.replace(written, instead), encoding="utf-8")
+    table = read_poses(tmp_path / "a.SRT", hfov_deg=None)
+    pose = table.at(0, capture_ns=7)
+    assert pose.camera.pitch_deg == pitch
+    assert pose.hfov_deg == pytest.approx(2 * math.degrees(math.atan(18 / focal_mm)))
+    assert table.notes == ()
 
 
 def test_errors_of_a_centimetre_are_taken(tmp_path):
@@ -90,9 +91,8 @@ def test_errors_of_a_centimetre_are_taken(tmp_path):
 
 def test_subtitles_of_the_first_models_give_the_place_alone(tmp_path):
     """Longitude comes first there: the drone would be on another continent."""
-    file = tmp_path / "old.srt"
-    file.write_text(PHANTOM, encoding="utf-8")
-    pose = at(file, 1.0, hfov_deg=70)
+    (tmp_path / "old.srt").write_text(PHANTOM, encoding="utf-8")
+    pose = at(tmp_path / "old.srt", 1.0, hfov_deg=70)
     assert (pose.latitude_deg, pose.longitude_deg, pose.height_m) == (47.3769, 8.5417, 80.1)
     assert pose.camera is None
     assert pose.hfov_deg == 70
