@@ -38,6 +38,11 @@ _NEVER = (
 """Whatever else refuses a stream may be a camera or a server that starts after us."""
 _STAMPED = frozenset({"mpegts", "rtsp", "rtp", "sdp", "flv"})
 """Formats whose time stamps are the sender's; of pictures in a row FFmpeg invents them."""
+_IN_SEGMENTS = frozenset({"hls", "dash"})
+"""Formats of which seconds come at once: each packet is held back until it is due by its own time."""
+_PLAYLIST = ".m3u8"
+_MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
+"""Beyond it the others go by this one: after a wait for more, or a jump of the time stamps."""
 _OPTIONS = {
     **DEMUX_OPTIONS,
     "rtsp_transport": "tcp",  # over UDP a camera's keyframes lose packets on the first busy switch
@@ -60,7 +65,8 @@ class StreamGrabber:
 
     def __init__(self, url: str, *, open_s: float = _OPEN_S, read_s: float = LEAST_PATIENCE_S) -> None:
         self.name = redacted(url)
-        self._url, self._open_s, self._read_s = url, open_s, read_s
+        self._url, self._open_s = url, open_s
+        self._read_s = max(read_s, _UNDECODED_S) if _PLAYLIST in url.lower() else read_s
         self._container: Any = None
         self.notes = notes = Notes(self.name)
         self._choose = partial(choose_stream, note=notes)
@@ -173,6 +179,7 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
     """The packets of the film as they come. Raises `SignalLost` where for ten seconds all else alone came."""
     packets = container.demux()  # of the film alone it would not return while others come
     until_s = time.monotonic() + _UNDECODED_S
+    in_segments, zero_s = container.format.name in _IN_SEGMENTS, None
     while True:
         packet: Any = None
         _PyAvClock.here.until_s = until_s
@@ -187,10 +194,21 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
             _PyAvClock.here.until_s = math.inf
         late = time.monotonic() > until_s
         if packet is not None and packet.stream.index == stream.index:
+            if in_segments and packet.dts is not None:
+                zero_s = _held_back(float(packet.dts * packet.time_base), zero_s)
             yield packet
             until_s = time.monotonic() + _UNDECODED_S
         if late:
             raise SignalLost("it sends no picture")
+
+
+def _held_back(at_s: float, zero_s: float | None) -> float:
+    # Wait until a packet of that time is due, where time 0 was at ``zero_s`` of the clock; returns the latter.
+    now_s = time.monotonic()
+    if zero_s is None or not -_MOST_LATE_S < zero_s + at_s - now_s < _MOST_EARLY_S:
+        return now_s - at_s
+    time.sleep(max(0.0, zero_s + at_s - now_s))
+    return zero_s
 
 
 def camera_time_ns(packet: av.Packet[Any], *, stamped: bool) -> int | None:

@@ -55,6 +55,24 @@ def test_a_camera_of_which_sound_alone_goes_on_has_stopped(monkeypatch, grabber)
     camera.close()
 
 
+def test_a_stream_that_comes_in_segments_is_played_by_its_own_time(tmp_path, monkeypatch):
+    """Of two seconds of live HLS, which come at once, one picture was shown."""
+    now_s = [0.0]
+    clock = SimpleNamespace(
+        monotonic=lambda: now_s[0], sleep=lambda wait_s: now_s.append(now_s.pop() + wait_s)
+    )
+    monkeypatch.setattr(stream, "time", clock)
+    with av.open(str(tmp_path / "a.m3u8"), "w", options={"hls_time": "0.4"}) as output:
+        film = output.add_stream("libx264", rate=25, options={"bf": "0", "g": "10"})
+        film.width, film.height, film.pix_fmt = 128, 64, "yuv420p"
+        for _ in range(30):
+            output.mux(film.encode(av.VideoFrame(128, 64, "yuv420p")))
+        output.mux(film.encode(None))
+    with av.open(str(tmp_path / "a.m3u8")) as live:
+        came_s = [now_s[0] for packet in stream.packets_of(live, live.streams.video[0]) if packet.size]
+    assert came_s == pytest.approx([number / 25 for number in range(30)])
+
+
 def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(tmp_path, monkeypatch):
     """It was dark for ever: PyAV passes over each packet of it, and waits for more of the one before."""
     seconds = itertools.count()
