@@ -18,7 +18,7 @@ import zenoh
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings
-from programs.processes import eventually, router
+from programs.processes import eventually, free_ports, router
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 KEYS = EdgeKeys("uav-1")
@@ -55,11 +55,13 @@ def _client(endpoint: str) -> zenoh.Config:
     return config
 
 
-@pytest.mark.parametrize("receiver", ["ground behind the router", "client"])
-def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> None:
+@pytest.mark.parametrize("receiver", ["ground behind the router", "one that listens too", "client"])
+def test_messages_questions_and_presence_pass(receiver: str) -> None:
     """Where both sides can only call out, the router is the link: all of the key table must get through it."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    ground = LinkSettings(role="ground", connect=(endpoint,))
+    endpoint, own = (f"tcp/127.0.0.1:{port}" for port in free_ports(2))
+    ground = LinkSettings(
+        role="ground", connect=(endpoint,), listen=(own,) if receiver == "one that listens too" else ()
+    )
     with ExitStack() as stack:
         stack.enter_context(router("--listen", endpoint))
         edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))

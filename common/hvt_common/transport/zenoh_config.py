@@ -106,7 +106,7 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     if settings.links == 2 or (effective and not _mentions(said, _MAX_LINKS)):
         # Who listens takes what comes. Asking for more than one makes every handshake a kilobyte longer.
         config.insert_json5(_MAX_LINKS, "2")
-    if settings.role == "ground" and not effective and not _mentions(said, "mode"):
+    if settings.role == "ground" and (connect or _endpoints(said, "connect")) and not _mentions(said, "mode"):
         # Since Zenoh 1.9 a router does not pass messages between two peers, but it does between a peer and a router.
         # An edge that listens is served just as well. ("client" would wait at its start, deaf to Ctrl-C.)
         config.insert_json5("mode", '"router"')
