@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
 """X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which ``ssl`` passes on but does not name."""
-_SOON_S = 30 * 86_400.0
+SOON_S = 30 * 86_400.0
 _SECURED = ("tls/", "quic/")
 
 
@@ -120,6 +120,12 @@ def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | N
         )
 
 
+def shown_to_callers(config: zenoh.Config, *, listen: Sequence[str]) -> Certificate | None:
+    """The certificate with which this machine listens: Zenoh reads it once. None without; UserError if unusable."""
+    pair = TlsFiles.of(config).listen
+    return pair.read(as_server=True) if pair is not None and _any_secured(listen) else None
+
+
 def dated(time_s: float) -> str:
     """A moment as people read it, UTC."""
     return dt.datetime.fromtimestamp(time_s, dt.UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -181,7 +187,7 @@ def _check_pair(pair: KeyPair, *, side: str, name: str | None, now_s: float) -> 
             dated(certificate.not_before_s),
             dated(now_s),
         )
-    elif certificate.not_after_s < now_s + _SOON_S:
+    elif certificate.not_after_s < now_s + SOON_S:
         _log.warning(
             "%s: this certificate expires on %s: make a new one in time with hvt-ground keys",
             pair.certificate,

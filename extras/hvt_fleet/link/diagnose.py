@@ -21,7 +21,7 @@ from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
 from hvt_common.transport.stale_sockets import end_of
 from hvt_common.transport.zenoh_config import LinkSettings, connect_endpoints
-from hvt_fleet.link.certificate import TlsFiles, check_own_keys
+from hvt_fleet.link.certificate import SOON_S, TlsFiles, check_own_keys, dated, shown_to_callers
 from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
 from hvt_fleet.link.probe import why_no_link
 from hvt_fleet.link.strangers import Strangers, listening_ports
@@ -67,6 +67,9 @@ class Watch(LinkWatch):
         self._file = settings.zenoh_config
         self._edge = settings.name
         self._served = served
+        self._shown = shown_to_callers(self.config, listen=self.listen)
+        self._ages = min(1, self._age())
+        """How often its age has been told: the start tells of one that ends soon."""
         self._trouble = ""
         self._said_s = 0.0
         self._two_links = _connected_twice(self.config)
@@ -108,12 +111,29 @@ class Watch(LinkWatch):
             if now_s < next_check_s:
                 continue
             next_check_s = now_s + min(_CHECK_S, self._patience_s)
+            self._check_age()
             if self._check(now_s):
                 self._trouble = ""
                 next_visit_s, pause_s = now_s + self._patience_s, _FIRST_PAUSE_S
             elif now_s >= next_visit_s:
                 self._explain()
                 next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
+
+    def _age(self) -> int:
+        # Of the certificate that callers see: 1 where it ends soon, 2 where it has ended.
+        end_s = math.inf if self._shown is None else self._shown.not_after_s
+        return (end_s < time.time() + SOON_S) + (end_s < time.time())
+
+    def _check_age(self) -> None:
+        if (age := self._age()) > self._ages and self._shown is not None:
+            self._ages = age
+            _log.warning(
+                "the certificate with which this machine listens %s on %s: %s; make a new one with hvt-ground keys "
+                "renew, copy it here and restart",
+                "expires" if age == 1 else "expired",
+                dated(self._shown.not_after_s),
+                "after that nobody can connect" if age == 1 else "nobody can connect any more",
+            )
 
     def _check(self, now_s: float) -> bool:
         with self._using:

@@ -29,7 +29,6 @@ _ALERT_S = 1.0
 _TCP = re.compile(r"(?P<protocol>tcp|tls|ws)/(?P<host>\[[^\]]+\]|[^:/]+):(?P<port>\d{1,5})([?#].*)?")
 
 # Verification errors of OpenSSL, x509_vfy.h.
-_NOT_YET_VALID, _EXPIRED = 9, 10
 _OTHER_CA = {2, 7, 18, 19, 20, 21}
 _OTHER_HOST = {62, 64}
 
@@ -141,7 +140,7 @@ def _tls(place: _Place, files: TlsFiles) -> str:
     finally:
         tcp.close()
     with closing(tls):
-        return _after_handshake(tls, files)
+        return _out_of_date(Certificate.of(tls.getpeercert() or {})) or _after_handshake(tls, files)
 
 
 def _after_handshake(tls: ssl.SSLSocket, files: TlsFiles) -> str:
@@ -168,29 +167,37 @@ def _their_certificate(place: _Place, files: TlsFiles, error: ssl.SSLCertVerific
             "may still be another): both sides need the ca.pem of one fleet"
         )
     seen = _shown_certificate(place, files)
-    whose = f" of {seen.name!r}" if seen is not None and seen.name else ""
-    if code == _EXPIRED:
-        when = f" on {dated(seen.not_after_s)}" if seen is not None else ""
-        return f"the other side's certificate{whose} expired{when}; it is {dated(time.time())} here"
-    if code == _NOT_YET_VALID:
-        when = f" until {dated(seen.not_before_s)}" if seen is not None else ""
-        return (
-            f"the other side's certificate{whose} is not valid{when}; it is {dated(time.time())} here: is the "
-            "clock right?"
-        )
     if code in _OTHER_HOST and seen is not None:
         return (
-            f"its certificate{whose} is for {', '.join(seen.hosts) or 'no host at all'}, not for {place.host!r}: "
-            f"connect to one of these, or make its keys again with --host {place.host}"
+            f"its certificate{_whose(seen)} is for {', '.join(seen.hosts) or 'no host at all'}, not for "
+            f"{place.host!r}: connect to one of these, or make its keys again with --host {place.host}"
         )
     return f"its certificate is not accepted ({error.verify_message})"
 
 
+def _out_of_date(seen: Certificate) -> str:
+    now_s = time.time()
+    if seen.not_after_s < now_s:
+        return (
+            f"the other side's certificate{_whose(seen)} expired on {dated(seen.not_after_s)}; it is "
+            f"{dated(now_s)} here"
+        )
+    if seen.not_before_s > now_s:
+        return (
+            f"the other side's certificate{_whose(seen)} is not valid until {dated(seen.not_before_s)}; it is "
+            f"{dated(now_s)} here: is the clock right?"
+        )
+    return ""
+
+
+def _whose(seen: Certificate) -> str:
+    return f" of {seen.name!r}" if seen.name else ""
+
+
 def _shown_certificate(place: _Place, files: TlsFiles) -> Certificate | None:
-    # The other side's certificate, whatever its host and date say; it must be of our CA all the same.
+    # The other side's certificate, whatever its host says; it must be of our CA all the same.
     context = _context(files)
     context.check_hostname = False
-    context.verify_flags |= NO_CHECK_TIME
     try:
         with (
             closing(socket.create_connection((place.host, place.port), timeout=_STEP_S)) as tcp,
@@ -223,9 +230,11 @@ def _alert(error: ssl.SSLError, files: TlsFiles) -> str:
 
 
 def _context(files: TlsFiles) -> ssl.SSLContext:
-    # A TLS context like Zenoh's; UserError for files that have become unusable since the start.
+    # A TLS context like Zenoh's, which takes a CA of any date (`_out_of_date` judges certificates); UserError for
+    # files that have become unusable since the start.
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = files.verify_name
+    context.verify_flags |= NO_CHECK_TIME
     try:
         if files.root_ca is None:
             context.load_default_certs()

@@ -90,12 +90,18 @@ class Authority:
         """Write ``name.key`` and ``name.pem``; an older pair of that name is replaced, but not withdrawn.
 
         ``name`` is the common name, also accepted as a host name; others connect to this machine at ``hosts``.
-        Validity counts from ``now``, with a time zone; None for this moment.
+        Validity counts from ``now``, with a time zone; None for this moment. It ends with the CA's at the latest;
+        `UserError` where that has ended.
         """
+        if self.until < dt.datetime.now(dt.UTC):
+            raise UserError(
+                f"the CA in {self.folder} ended on {self.until:%Y-%m-%d}: make another one with hvt-ground keys "
+                "new-ca in another --dir, and new keys for all machines"
+            )
         key = ec.generate_private_key(ec.SECP256R1())
         authority_id = x509.SubjectKeyIdentifier.from_public_key(self._key.public_key())
         certificate = (
-            _dated(x509.CertificateBuilder(), days=MACHINE_DAYS, now=now)
+            _dated(x509.CertificateBuilder(), days=MACHINE_DAYS, now=now, last=self.until)
             .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)]))
             .issuer_name(self._certificate.subject)
             .public_key(key.public_key())
@@ -115,6 +121,11 @@ class Authority:
         )
         _write_pair(self.folder, name, key, certificate)
 
+    @property
+    def until(self) -> dt.datetime:
+        """When the CA ends: Zenoh does not look at that, other programs do."""
+        return self._certificate.not_valid_after_utc
+
     def valid_until(self, name: str) -> str:
         """The day on which a machine's certificate ends; says so where it cannot be read."""
         try:
@@ -132,10 +143,15 @@ class Authority:
 
 
 def _dated(
-    builder: x509.CertificateBuilder, *, days: int, now: dt.datetime | None = None
+    builder: x509.CertificateBuilder,
+    *,
+    days: int,
+    now: dt.datetime | None = None,
+    last: dt.datetime | None = None,
 ) -> x509.CertificateBuilder:
     now = now or dt.datetime.now(dt.UTC)
-    return builder.not_valid_before(now - _CLOCKS_APART).not_valid_after(now + dt.timedelta(days=days))
+    until = now + dt.timedelta(days=days)
+    return builder.not_valid_before(now - _CLOCKS_APART).not_valid_after(min(until, last or until))
 
 
 def _host(text: str) -> x509.GeneralName:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import datetime as dt
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,7 @@ def run(argv: Sequence[str]) -> int:
     """Run ``hvt-ground keys …``; `UserError` where the user can mend something."""
     arguments = _parser().parse_args(argv)
     with needs_extra("'hvt[ground]'"):  # only now: a ground that uses no keys needs no cryptography
-        from hvt_fleet.pki.authority import Authority  # noqa: PLC0415
+        from hvt_fleet.pki.authority import MACHINE_DAYS, Authority  # noqa: PLC0415
     folder: Path = arguments.dir
     if arguments.command == "new-ca":
         Authority.create(folder)
@@ -33,6 +34,11 @@ def run(argv: Sequence[str]) -> int:
         )
         return 0
     authority = Authority.open(folder)
+    if authority.until < dt.datetime.now(dt.UTC) + dt.timedelta(days=MACHINE_DAYS):
+        say(
+            f"the CA in {folder} ends on {authority.until:%Y-%m-%d}, and its keys with it: make another one in time, "
+            "with new-ca in another --dir, and new keys for all machines"
+        )
     before = Roster.read(folder)
     if arguments.command == "list":
         _list(before, authority)

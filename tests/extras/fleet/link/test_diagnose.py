@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import logging
 import os
 import re
@@ -24,6 +25,7 @@ from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_fleet.link.certificate import KeyPair, TlsFiles
 from hvt_fleet.link.diagnose import Watch, visit
 from hvt_fleet.link.probe import why_no_link
+from hvt_fleet.pki import authority
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.outsider import joined
 from programs.processes import eventually, free_ports
@@ -158,7 +160,38 @@ def test_two_links_to_one_place_are_explained_once(free_port: int) -> None:
     assert said.startswith(f"tcp/127.0.0.1:{free_port}: nobody")
 
 
+def test_a_ca_that_has_ended_is_not_the_reason(
+    tmp_path: Path, free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh takes it; the user read that the ground's good certificate expired in three years."""
+    monkeypatch.setattr(authority, "CA_DAYS", 0)
+    monkeypatch.setattr(authority.Authority, "until", dt.datetime.max.replace(tzinfo=dt.UTC))
+    old = Fleet(tmp_path / "keys")
+    old.keys("add-edge", "uav-1")
+    old.keys("add-ground", "base", "--host", "127.0.0.1")
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    with open_session(old.settings("base", "ground", listen=(endpoint,))):
+        said = why_no_link(endpoint, _files(old))
+    assert "TLS works, both certificates are in order, but no Zenoh link comes of it" in said
+
+
 # The watch
+
+
+def test_a_certificate_that_ends_in_flight_is_told_where_it_listens(
+    fleet: Fleet, tmp_path: Path, free_port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A ground that ran for months refused every edge, and only the edges, in the air, said why."""
+    old = fleet.copy(tmp_path / "old")
+    old.reissue("base", "127.0.0.1", now=EXPIRED)
+    settings = old.settings("base", "ground", listen=(f"tls/127.0.0.1:{free_port}",))
+    with (
+        zenoh.open(configure(settings)[0]) as session,
+        Watch(session, settings, served=lambda _: True, patience_s=0.1),
+    ):
+        eventually(lambda: caplog.records)
+    assert "listens expired on" in caplog.text
+    assert caplog.text.count("nobody can connect any more; make a new one with hvt-ground keys renew") == 1
 
 
 def test_the_watch_explains_once_and_is_quiet_when_the_link_comes(

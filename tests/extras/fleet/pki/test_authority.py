@@ -18,6 +18,7 @@ from cryptography.x509.oid import NameOID
 from hvt_common.errors import UserError
 from hvt_common.transport.link_doctor import Rights
 from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_fleet.pki import authority
 from hvt_fleet.pki.command import run
 from hvt_fleet.pki.roster import Roster
 from hvt_ground.cli import main
@@ -264,6 +265,24 @@ def test_a_disk_that_fills_up_between_key_and_certificate_changes_neither(
     with pytest.raises(UserError, match=r"uav-1.pem cannot be written \(No space left on device\)"):
         fleet.keys("renew", "uav-1")
     assert {file: file.read_bytes() for file in fleet.folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("days", [100, 0])
+def test_no_key_outlives_its_ca(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], days: int
+) -> None:
+    """A key of 825 days from a CA with a month left: programs that check it fall silent, and none had warned."""
+    monkeypatch.setattr(authority, "CA_DAYS", days)
+    fleet = Fleet(tmp_path / "keys")
+    until = _certificate(fleet, "ca").not_valid_after_utc
+    if not days:
+        with pytest.raises(UserError, match=rf"the CA in \S+ ended on {until:%Y-%m-%d}: make another one"):
+            fleet.keys("add-edge", "uav-1")
+        assert not fleet.file("uav-1").exists()
+        return
+    fleet.keys("add-edge", "uav-1")
+    assert _certificate(fleet, "uav-1").not_valid_after_utc == until
+    assert f"keys ends on {until:%Y-%m-%d}, and its keys with it: make another" in capsys.readouterr().out
 
 
 def test_a_folder_in_the_place_of_a_file_is_a_sentence(fleet: Fleet) -> None:
