@@ -25,6 +25,7 @@ _MAY_COME = frozenset(
         *(errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM),
     }
 )
+_INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
 
@@ -153,7 +154,8 @@ def exit_with_sentence(
 ) -> int:
     """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError` or a `NotYetError`, said.
 
-    Neither that nor a traceback has the secrets of an address in ``argv``.
+    130, as of a shell, where the user has interrupted it. Neither that nor a traceback has the secrets of an address
+    in ``argv``.
 
     Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word; a full disk
     with 1. Standard streams that were closed are /dev/null.
@@ -169,6 +171,9 @@ def exit_with_sentence(
         if not error.said:
             print(f"{program}: {redaction.text(str(error))}", file=sys.stderr)
         return 2 if isinstance(error, UserError) and not isinstance(error, NotYetError) else 1
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
+        return _INTERRUPTED
     except BrokenPipeError:
         if not _reader_left():
             raise

@@ -24,7 +24,6 @@ from hvt_models.manifest import ModelEntry
 from hvt_models.store import Store, file_digest
 
 _PROGRAM = "hvt-models"
-_INTERRUPTED = 130
 _SHOWN_CLASSES = 12
 _EMBEDDED = {
     EMBEDDED_DETECTOR: ("detector", "part of HVT: vehicles and people, aerial"),
@@ -34,11 +33,7 @@ _EMBEDDED = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``hvt-models``; 0, or 2 after one sentence on stderr where the user can mend something."""
-    try:
-        return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
-    except KeyboardInterrupt:
-        print(f"{_PROGRAM}: stopped; the same command goes on from there", file=sys.stderr)
-        return _INTERRUPTED
+    return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
 
 
 def _run(argv: Sequence[str] | None) -> int:

@@ -28,7 +28,6 @@ COMMANDS: Final = {
 
 RENAMED: Final = {"sight": "compare"}  # the former name works for one release
 _PROGRAM = "hvt-study"
-_INTERRUPTED = 130
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -40,15 +39,8 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``hvt-study``; 0, or 2 after one sentence on stderr where the user can mend something.
-
-    130, as of a shell, where the user has interrupted it.
-    """
-    try:
-        return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
-    except KeyboardInterrupt:
-        print(f"{_PROGRAM}: interrupted", file=sys.stderr)
-        return _INTERRUPTED
+    """Run ``hvt-study``; 0, or 2 after one sentence on stderr where the user can mend something."""
+    return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
 
 
 def _run(argv: Sequence[str] | None) -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hvt_common.config import load
-from hvt_common.errors import NotYetError, Parser, UserError, may_come, named_path
+from hvt_common.errors import NotYetError, Parser, UserError, exit_with_sentence, may_come, named_path
 from hvt_common.files import read_text
 from hvt_common.inference.labels import read_labels
 from hvt_common.transport.zenoh_config import LinkSettings, key_pair
@@ -145,3 +145,13 @@ def test_output_for_which_there_is_no_room_is_a_sentence(tmp_path):
     assert done.returncode == 1
     says = "it: a disk that it writes to is full (No space left on device): make room there"
     assert done.stderr.splitlines() == ["said", says]
+
+
+def test_an_interruption_is_a_sentence(capsys):
+    """Ctrl-C while a ground starts, or in the middle of an export, showed forty lines of a traceback."""
+
+    def run(_argv):
+        raise KeyboardInterrupt
+
+    assert exit_with_sentence(run, program="it", argv=[]) == 130
+    assert capsys.readouterr().err == "it: interrupted\n"
