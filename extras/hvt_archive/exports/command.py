@@ -108,6 +108,8 @@ def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
         part.replace(path)
     except (OSError, av.error.FFmpegError) as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from error
+    except UserError as error:
+        raise UserError(str(error).replace(str(part), str(path))) from error
     finally:
         part.unlink(missing_ok=True)
 

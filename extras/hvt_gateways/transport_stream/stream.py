@@ -9,6 +9,7 @@ import heapq
 import io
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -187,8 +188,11 @@ def write_recorded(recorded: Recorded, path: Path) -> None:
     try:
         for item in items:
             stream.log(item)
-    finally:
-        stream.close()
+    except BaseException:
+        with suppress(UserError):  # the first failure is the reason
+            stream.close()
+        raise
+    stream.close()
 
 
 def _streams(container: OutputContainer, platform: Platform) -> tuple[Stream, Stream]:
