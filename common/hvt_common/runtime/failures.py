@@ -20,6 +20,8 @@ _Answer = TypeVar("_Answer")
 _REDACTION = Redaction()
 _STEADY_NS = 60 * SECOND_NS
 """A failure after it worked for so long is news."""
+_SILENT_NS = 10 * SECOND_NS
+"""The slowest network answers sooner."""
 _STEADY_PAUSES = 10
 """What has worked for so many first pauses is tried again after the first one: that costs little."""
 
@@ -67,6 +69,11 @@ class Failures:
         self._parts: dict[str, Failure] = {}
         self._said: set[str] = set()
         """Parts that the log has reported as failed."""
+        self._checks: list[Callable[[], object]] = []
+
+    def watch(self, check: Callable[[], object]) -> None:
+        """Have ``check()`` called before each look at what fails now: it says whether a part hangs."""
+        self._checks.append(check)
 
     @property
     def parts(self) -> tuple[Failure, ...]:
@@ -75,6 +82,8 @@ class Failures:
 
     @property
     def now(self) -> tuple[FailedPart, ...]:
+        for check in self._checks:
+            check()
         return tuple(
             FailedPart(one.part, one.reason, one.since_ns)
             for one in self.parts
@@ -143,6 +152,8 @@ class RetryPause:
 class Retried(Generic[_Part]):
     """A part that may raise whatever it likes: it is opened again after a pause. Threads take turns.
 
+    One that hangs, as a driver may, is waited for, and has failed until it answers.
+
     ``failures`` has it under ``name``; ``clock`` is nanoseconds without steps. Raises what ``open_part`` does.
     """
 
@@ -161,8 +172,16 @@ class Retried(Generic[_Part]):
         self._failures = failures
         self._clock = clock
         self._pause = RetryPause()
-        self._failed = False
+        self._failed = self._hangs = False
+        self._asked_ns: int | None = None
         self._lock = threading.Lock()
+        failures.watch(self._check)
+
+    def _check(self) -> None:
+        asked_ns = self._asked_ns
+        if asked_ns is not None and not self._hangs and self._clock() - asked_ns > _SILENT_NS:
+            self._hangs = True
+            self._failures.failed(self._name, f"no answer for {_SILENT_NS // SECOND_NS} s")
 
     def run(self, use: Callable[[_Part], _Answer]) -> _Answer | None:
         """None where it fails, or has failed and is left alone for a while."""
@@ -172,14 +191,17 @@ class Retried(Generic[_Part]):
             try:
                 if self._failed:
                     self.part = self._open_part()
+                self._asked_ns = self._clock()
                 answer = use(self.part)
             except Exception as error:  # noqa: BLE001 - a runtime raises what it likes
                 self._pause.failed(self._clock(), again=self._failed)
                 self._failed = True
                 self._failures.failed(self._name, reason_of(error))
                 return None
-            if self._failed:
-                self._failed = False
+            finally:
+                self._asked_ns = None
+            if self._failed or self._hangs:
+                self._failed = self._hangs = False
                 self._failures.works(self._name)
             return answer
 

@@ -87,3 +87,25 @@ def test_a_part_that_takes_long_to_fail_has_not_worked_meanwhile():
         detector.run(failing)
         clock.now_ns += SECOND_NS
     assert 8 <= len(opened) <= 13
+
+
+def test_a_part_that_hangs_is_said_until_it_answers(caplog):
+    """A driver stops answering: there would be no new box, and the status would call all well for the whole flight."""
+    clock = Clock(0)
+    failures = Failures(clock)
+    detector = Retried(lambda: None, "detector", failures, clock=clock)
+
+    def hang(_part: object) -> str:
+        seen = []
+        for _ in range(12):
+            clock.now_ns += SECOND_NS
+            seen.append([one.reason for one in failures.now])
+        assert seen == [[]] * 10 + [["no answer for 10 s"]] * 2
+        return "found"
+
+    assert detector.run(hang) == "found"
+    assert not failures.now
+    assert [one.partition(";")[0] for one in caplog.messages] == [
+        "detector: no answer for 10 s",
+        "detector: works again",
+    ]
