@@ -17,7 +17,7 @@ from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
-from hvt_ground.sinks.rerun.readable import readable
+from hvt_ground.sinks.rerun.readable import readable, what_is_read
 from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
@@ -66,7 +66,7 @@ def _read(path: Path) -> tuple[str, list[Chunk]]:
     except (OSError, RuntimeError, ValueError) as error:
         raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
     if found != name:
-        _log.warning("%s is damaged or breaks off: what can be read is joined", path)
+        _log.warning("%s %s is joined", path, what_is_read(path))
     return edge, chunks
 
 

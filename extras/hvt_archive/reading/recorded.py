@@ -42,7 +42,7 @@ from hvt_ground.sinks.rerun.blueprint import (
     VIDEO,
 )
 from hvt_ground.sinks.rerun.map_rows import pose_of
-from hvt_ground.sinks.rerun.readable import has_holes, next_recording, readable
+from hvt_ground.sinks.rerun.readable import has_holes, readable, what_is_read
 from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId
 
@@ -253,11 +253,8 @@ def _opened(path: Path, spool: Spool, number: int) -> _File:
             lost = file.drop_after_holes() if found != name and has_holes(path, found) else 0
         except _ODD as error:
             raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
-    if next_at := found != name and next_recording(path):
-        what = "is several recordings in one file: the first is exported; another begins after %d bytes"
-        _log.warning(f"%s {what}", path, next_at)
-    elif found != name:
-        _log.warning("%s is damaged or breaks off: what can be read is exported", path)
+    if found != name:
+        _log.warning("%s %s is exported", path, what_is_read(path))
     if lost:
         _log.warning("%s: %d pictures after a hole are left out: they need one that is lost", path, lost)
     return file

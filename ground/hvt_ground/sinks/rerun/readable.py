@@ -54,8 +54,15 @@ def has_holes(path: Path, copy: Path) -> bool:
     return copy.stat().st_size < max(ends, default=0)
 
 
-def next_recording(path: Path) -> int:
-    """After how many bytes of a file another recording begins; 0 where none does."""
+def what_is_read(path: Path) -> str:
+    """Of a file that `readable` made a copy of, why, and which part: the beginning of a sentence."""
+    next_at = _next_recording(path)
+    several = f"is several recordings in one file, another begins after {next_at} bytes: the first"
+    return several if next_at else "is damaged or breaks off: what can be read"
+
+
+def _next_recording(path: Path) -> int:
+    # After how many bytes; 0 where none does.
     with path.open("rb") as file:
         head = file.read(STREAM_HEADER_BYTES)
         end = max((end for _, end in whole_messages(file.fileno())), default=0)

@@ -6,6 +6,7 @@ import os
 
 import pytest
 
+from hvt_archive.joined import join_recordings
 from hvt_archive.reading.recorded import read_recordings
 from media.recorded_feed import coded, drawn_frames, session
 from programs.rrd import damaged, recorded
@@ -35,7 +36,6 @@ def test_what_is_no_damage_is_not_called_so(events, tmp_path, caplog):
     with two.open("ab") as file:
         file.write(other)
     assert [len(read_recordings([one]).video) for one in (odd, two)] == [FRAMES, FRAMES]
-    said = f"the first is exported; another begins after {odd.stat().st_size} bytes"
-    assert [one.getMessage() for one in caplog.records] == [
-        f"{two} is several recordings in one file: {said}"
-    ]
+    join_recordings([two], tmp_path / "joined.rrd", base_size=SIZE, fps=15)
+    said = f"{two} is several recordings in one file, another begins after {odd.stat().st_size} bytes: the first is"
+    assert [one.getMessage() for one in caplog.records] == [f"{said} exported", f"{said} joined"]
