@@ -173,13 +173,13 @@ class Retried(Generic[_Part]):
         self._clock = clock
         self._pause = RetryPause()
         self._failed = self._hangs = False
-        self._asked_ns: int | None = None
+        self._began_ns: int | None = None
         self._lock = threading.Lock()
         failures.watch(self._check)
 
     def _check(self) -> None:
-        asked_ns = self._asked_ns
-        if asked_ns is not None and not self._hangs and self._clock() - asked_ns > _SILENT_NS:
+        began_ns = self._began_ns
+        if began_ns is not None and not self._hangs and self._clock() - began_ns > _SILENT_NS:
             self._hangs = True
             self._failures.failed(self._name, f"no answer for {_SILENT_NS // SECOND_NS} s")
 
@@ -191,7 +191,7 @@ class Retried(Generic[_Part]):
             try:
                 if self._failed:
                     self.part = self._open_part()
-                self._asked_ns = self._clock()
+                self._began_ns = self._clock()
                 answer = use(self.part)
             except Exception as error:  # noqa: BLE001 - a runtime raises what it likes
                 self._pause.failed(self._clock(), again=self._failed)
@@ -199,7 +199,7 @@ class Retried(Generic[_Part]):
                 self._failures.failed(self._name, reason_of(error))
                 return None
             finally:
-                self._asked_ns = None
+                self._began_ns = None
             if self._failed or self._hangs:
                 self._failed = self._hangs = False
                 self._failures.works(self._name)

@@ -104,7 +104,7 @@ def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
     try:
         yield part
         if new and not claim_name(path):
-            raise UserError(f"{path} is there already: name another with --out")
+            raise UserError(f"{path} is there already: name another with --out")  # noqa: TRY301
         part.replace(path)
     except (OSError, av.error.FFmpegError) as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from error

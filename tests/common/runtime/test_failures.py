@@ -90,7 +90,7 @@ def test_a_part_that_takes_long_to_fail_has_not_worked_meanwhile():
 
 
 def test_a_part_that_hangs_is_said_until_it_answers(caplog):
-    """A driver stops answering: there would be no new box, and the status would call all well for the whole flight."""
+    """A driver stops answering: there would be no new box, and the status would call all well to the end."""
     clock = Clock(0)
     failures = Failures(clock)
     detector = Retried(lambda: None, "detector", failures, clock=clock)
