@@ -239,6 +239,10 @@ def _open(url: str, *, open_s: float, read_s: float) -> Any:
     except (av.error.FFmpegError, OSError, ValueError) as error:
         name, cause = redacted(url), cause_of(error)
         kind = UserError if isinstance(error, _NEVER) else NotYetError
+        if isinstance(error, av.error.ProtocolNotFoundError):
+            cause = (
+                "PyAV is built without it: ffmpeg -i ADDRESS -c copy -f mpegts udp://127.0.0.1:PORT brings it"
+            )
         if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("rtsp"):
             # FFmpeg's word for no answer, or half of one, too: a camera that boots opens its port first.
             kind, cause = NotYetError, "no answer of RTSP in time"

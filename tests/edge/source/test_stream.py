@@ -9,6 +9,7 @@ import threading
 from contextlib import suppress
 from fractions import Fraction
 from types import SimpleNamespace
+from unittest import mock
 
 import av
 import numpy as np
@@ -162,6 +163,14 @@ def test_a_stream_without_a_host_is_refused(address):
     """A script whose variable is empty writes it: the edge asked its own machine for the camera for ever."""
     with pytest.raises(UserError, match="names no host: give one"):
         open_source(address, size=(320, 180), fps=15)
+
+
+def test_a_protocol_that_pyav_lacks_is_said_with_a_way_round(monkeypatch):
+    """Of SRT, which its wheels are built without, the sentence was "within 10 s (Protocol not found)"."""
+    lacks = mock.Mock(side_effect=av.error.ProtocolNotFoundError(-1330794744, "Protocol not found"))
+    monkeypatch.setattr(av, "open", lacks)
+    with pytest.raises(UserError, match="built without it: ffmpeg -i ADDRESS -c copy"):
+        open_source("srt://camera:9000", size=(320, 180), fps=15)
 
 
 @pytest.mark.parametrize("scheme", ["RTSP", "Http", "UDP"])
