@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import optuna
@@ -55,21 +56,29 @@ def tunable(method: str, names: Iterable[str] = ()) -> dict[str, float]:
 
 
 def split(
-    sequences: Sequence[tuple[str, str]], *, held_out: float
+    sequences: Sequence[tuple[str, str]],
+    *,
+    held_out: float,
+    pictures: Mapping[tuple[str, str], str] = MappingProxyType({}),
 ) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """(training, held out), by a hash of the name: the same sequences in every run, whatever else is in the set.
 
-    Raises `UserError` where there are not two sequences, or the share leaves one side empty.
+    ``pictures`` names those that several sequences are flown over: what one side has seen the other does not get.
+    Raises `UserError` where there are not two names, or the share leaves one side empty.
     """
-    if len(sequences) < 2 or not 0 < held_out < 1:
+    names = [pictures.get(one, one[1]) for one in sequences]
+    order = sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).digest())
+    if len(order) < 2 or not 0 < held_out < 1:
+        of = "" if len(order) == len(names) else f" of {len(order)} pictures"
         raise UserError(
-            f"{len(sequences)} sequences with --held-out {held_out:g} cannot be split: give two or more, and "
+            f"{len(names)} sequences{of} with --held-out {held_out:g} cannot be split: give two or more, and "
             "a share between 0 and 1"
         )
-    order = sorted(sequences, key=lambda one: hashlib.sha256(one[1].encode()).digest())
     count = min(len(order) - 1, max(1, round(held_out * len(order))))
-    chosen = set(order[:count])
-    return [one for one in sequences if one not in chosen], [one for one in sequences if one in chosen]
+    sides: tuple[list[tuple[str, str]], list[tuple[str, str]]] = ([], [])
+    for one, name in zip(sequences, names, strict=True):
+        sides[name in order[:count]].append(one)
+    return sides
 
 
 def tune(
@@ -209,12 +218,14 @@ def run(arguments: argparse.Namespace) -> int:
     check_whole("--trials", arguments.trials, 1, _MOST_TRIALS)
     check_whole("--seed", arguments.seed, 0, _HIGHEST_SEED)
     parameters = tunable(arguments.method, names_of(arguments.parameters))
-    plan = study_plan(arguments, open_sequences(arguments))
+    sequences = open_sequences(arguments)
+    plan = study_plan(arguments, sequences)
     if len(plan.still_codecs) > 1:
         raise UserError(
             f"--still-codecs {arguments.still_codecs} are several: parameters are searched for one, name it"
         )
-    train, held_out = split(plan.sequences, held_out=arguments.held_out)
+    pictures = {(uri, one.name): one.files[0].stem for uri, one in sequences if one.dataset == "still"}
+    train, held_out = split(plan.sequences, held_out=arguments.held_out, pictures=pictures)
     written = make_out(arguments.out, name="tune.json")
     pool, _ = open_pool(arguments)
     progress = RunProgress(f"{arguments.method}, trials")
