@@ -114,6 +114,7 @@ def track_sessions() -> Iterator[tuple[str, list[Step]]]:
             (6, True, [0, 0, 1025, 4]),
             (9, False, [0, 0, 1025]),
             (9, False, [0, 0, 1024]),
+            (10, True, [*[1] * 1024, *[0] * (2 + 5 * 1024), 1, 1024]),
         ],
     )
     still = [1, 1, 0, 0]
