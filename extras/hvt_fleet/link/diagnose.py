@@ -17,7 +17,7 @@ from typing import Self
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
 from hvt_common.transport.stale_sockets import end_of
 from hvt_common.transport.zenoh_config import LinkSettings, connect_endpoints
@@ -28,7 +28,7 @@ from hvt_fleet.link.strangers import Strangers, listening_ports
 
 _log = logging.getLogger(__name__)
 
-_CHECK_S, _STRANGERS_S = 1.0, 0.1
+_CHECK_S, _STRANGERS_S, _ANSWER_S = 1.0, 0.1, 1.0
 PATIENCE_S = 4.0
 _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 """From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
@@ -77,6 +77,9 @@ class Watch(LinkWatch):
         self._had_two: set[str] = set()
         self._halved_s: float | None = None
         """The time since which one link of two has been missing; infinite once that is reported."""
+        self._ports = {end_of(one).rpartition(":")[2] for one in connect_endpoints(self.config)}
+        self._calls_since_s: float | None = None if settings.role == "ground" else math.inf
+        """The time since which a ground has had a link to a peer that it calls; infinite once that is judged."""
         self._first_seen_s: dict[str, float] = {}
         self._named: set[str] = set()
         self._stop = threading.Event()
@@ -144,6 +147,7 @@ class Watch(LinkWatch):
                 if links:
                     self._check_names(self._names(links), now_s)
                 self._check_second_link(links, now_s)
+                self._check_called(links, now_s)
             except zenoh.ZError:  # closed elsewhere
                 return True
             return bool(links)
@@ -198,6 +202,28 @@ class Watch(LinkWatch):
             self._had_two |= twice
         called = {str(link.zid) for link in links if _bare(str(link.dst)) in self._two_links}
         return any(zid in self._had_two | called for zid in standing.keys() - twice)
+
+    def _check_called(self, links: list[zenoh.Link], now_s: float) -> None:
+        # A peer that a ground calls is an edge, or a ground, whose edges it never sees. A router serves any name.
+        if self._calls_since_s == math.inf:
+            return
+        routers = {str(zid) for zid in self._session.info.routers_zid()}
+        called = [
+            str(link.dst)
+            for link in links
+            if str(link.zid) not in routers and end_of(link.dst).rpartition(":")[2] in self._ports
+        ]
+        if not called or self._calls_since_s is None:
+            self._calls_since_s = now_s if called else self._calls_since_s
+        elif now_s - self._calls_since_s > self._patience_s:
+            self._calls_since_s = math.inf
+            replies = self._session.liveliness().get(selector(Channel.ALIVE), timeout=_ANSWER_S)
+            if not self._served("") and all(one.ok is None for one in replies):
+                _log.warning(
+                    "linked to %s, but no edge is seen there: if another ground listens there, it passes nothing on; "
+                    "connect to the edge itself, or both grounds to a router (docs/deployment.md)",
+                    _bare(called[0]),
+                )
 
     def _explain(self) -> None:
         reasons = self._examine(self.config)

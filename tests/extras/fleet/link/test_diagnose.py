@@ -260,6 +260,25 @@ def test_a_second_link_that_does_not_come_is_said_once(
     )
 
 
+def test_a_ground_that_calls_another_is_told_that_it_passes_nothing_on(
+    free_port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A second screen connected to the first ground stayed empty, and said only that no edge was heard."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    settings = LinkSettings("ground", connect=(endpoint,))
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,))),
+        open_session(settings) as session,
+        Watch(session, settings, served=lambda _: False, patience_s=0.1) as watch,
+    ):
+        eventually(lambda: caplog.records)
+        assert watch.trouble == ""
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said.startswith(
+        f"linked to {endpoint}, but no edge is seen there: if another ground listens there, it"
+    )
+
+
 def test_a_guest_with_one_link_is_no_half(
     free_port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
