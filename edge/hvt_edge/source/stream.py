@@ -38,8 +38,8 @@ _NEVER = (
 """Whatever else refuses a stream may be a camera or a server that starts after us."""
 _STAMPED = frozenset({"mpegts", "rtsp", "rtp", "sdp", "flv"})
 """Formats whose time stamps are the sender's; of pictures in a row FFmpeg invents them."""
-_IN_SEGMENTS = frozenset({"hls", "dash"})
-"""Formats of which seconds come at once: each packet is held back until it is due by its own time."""
+_IN_SEGMENTS = "hls"
+"""The format of which seconds come at once: each packet is held back until it is due by its own time."""
 _PLAYLIST = ".m3u8"
 _MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
 """Beyond it the others go by this one: after a wait for more, or a jump of the time stamps."""
@@ -179,7 +179,7 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
     """The packets of the film as they come. Raises `SignalLost` where for ten seconds all else alone came."""
     packets = container.demux()  # of the film alone it would not return while others come
     until_s = time.monotonic() + _UNDECODED_S
-    in_segments, zero_s = container.format.name in _IN_SEGMENTS, None
+    in_segments, zero_s = container.format.name == _IN_SEGMENTS, None
     while True:
         packet: Any = None
         _PyAvClock.here.until_s = until_s
