@@ -59,7 +59,7 @@ def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
     tracked = request.track_id is not None
     newest, newest_held = ring.newest(tracked=False), ring.newest(tracked=tracked)
     if newest is None or newest_held is None:
-        raise RefusedError("there is no frame yet, or none is kept (--ring)")
+        raise RefusedError("no frame was looked at yet, or none is kept (--ring)")
     if request.frame_index is not None:
         if request.frame_index > newest.frame_index:
             raise RefusedError(
@@ -278,7 +278,7 @@ class OnDemand:
         """The newest frame's index, its tracks by id, of too many the most confident, and how many there are."""
         newest = self.ring.newest()
         if newest is None:
-            raise RefusedError("there is no frame yet, or none is kept (--ring)")
+            raise RefusedError("no frame was looked at yet, or none is kept (--ring)")
         self._want_tracks(newest.capture_ns)
         tracks = newest.tracks
         width, height = self.view.source_size  # a box that is only predicted may be far outside

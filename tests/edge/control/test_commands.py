@@ -183,7 +183,7 @@ def test_whoever_waits_can_ask_what_became_of_it():
 def test_the_tracks_are_those_of_the_newest_frame_in_source_pixels():
     """The ids that a still can be asked by would be guesswork."""
     rig = Rig()
-    assert "no frame yet" in rig.ask("tracks").reason
+    assert "no frame was looked at yet" in rig.ask("tracks").reason
     rig.run(10)
     answer = rig.ask("tracks")
     (track,) = answer.tracks

@@ -375,7 +375,7 @@ ANSWERS = {
     "…: … is missing, or not a word",
     "… takes no …",
     "the rates were changed a moment ago: wait two seconds",
-    "there is no frame yet, or none is kept (--ring)",
+    "no frame was looked at yet, or none is kept (--ring)",
     "this edge sends video alone and followed no objects; it does from now on: request again in a second",
     "… requested stills are pending already: try again later",
     "nothing is known of a still of the number …",
