@@ -48,6 +48,11 @@ def screenshot(recording: Path, *, frame: int, out: Path, size: tuple[int, int] 
         )
         try:
             png = _picture(port, recording, frame=frame)
+        except ConnectionError:
+            raise UserError(
+                f"the viewer ended while it drew {recording}: without a screen it has no letters but Latin, Greek "
+                "and Cyrillic, and no emoji, for names of classes"
+            ) from None
         finally:
             process.terminate()
             process.wait(timeout=10)

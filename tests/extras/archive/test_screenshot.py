@@ -52,6 +52,15 @@ def test_a_missing_recording_is_one_sentence(tmp_path: Path) -> None:
         screenshot(tmp_path / "a.rrd", frame=0, out=tmp_path / "gone" / "a.png")
 
 
+@needs_viewer
+def test_a_name_that_the_viewer_cannot_draw_is_one_sentence(tmp_path: Path) -> None:
+    """A class with an emoji ended in a traceback."""
+    text = Notice(0, 0, "info", "a \U0001f697 was seen")
+    path = rrd.recorded(tmp_path / "a.rrd", [text], edge_id="uav-1", base_size=(64, 48))
+    with pytest.raises(UserError, match=r"the viewer ended while it drew .*a\.rrd"):
+        screenshot(path, frame=0, out=tmp_path / "a.png")
+
+
 # Several recordings as one.
 
 
