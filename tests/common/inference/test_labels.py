@@ -10,6 +10,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES, kind_of, same_kind
 from hvt_common.inference.labels import (
     default_confidence,
+    detector_labels,
     first_synonym,
     is_calibrated,
     metadata_labels,
@@ -223,3 +224,11 @@ def test_a_model_says_whether_its_scores_are_probabilities(tmp_path):
     assert is_calibrated("aerial-nano", role="detector")
     assert not is_calibrated("motion", role="detector")
     assert "detector d.onnx has no calibration" in uncalibrated("detector", str(plain))
+
+
+def test_who_has_a_detector_without_names_is_told_how_each_side_gives_them(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """At the ground ``--labels`` names a classifier's classes: whoever did as told was refused."""
+    assert detector_labels(Path("nameless.onnx"), None, "", head="", classes=1, inputs=1) == ("class 0",)
+    assert "--labels FILE names them, of hvt-ground --detector-labels FILE" in caplog.text
