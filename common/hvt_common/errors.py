@@ -27,6 +27,8 @@ _MAY_COME = frozenset(
 )
 _INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+FOREIGN = (Exception, SystemExit)
+"""What code of others raises: much of it calls `sys.exit` where something is wrong."""
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
 
 

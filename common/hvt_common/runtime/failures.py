@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
-from hvt_common.errors import NotYetError, UserError
+from hvt_common.errors import FOREIGN, NotYetError, UserError
 from hvt_common.redaction import Redaction
 from hvt_common.units import SECOND_NS
 
@@ -193,7 +193,7 @@ class Retried(Generic[_Part]):
                     self.part = self._open_part()
                 self._began_ns = self._clock()
                 answer = use(self.part)
-            except Exception as error:  # noqa: BLE001 - a runtime raises what it likes
+            except FOREIGN as error:
                 self._pause.failed(self._clock(), again=self._failed)
                 self._failed = True
                 self._failures.failed(self._name, reason_of(error))

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 
+from hvt_common.errors import FOREIGN
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.runtime.process import lower_priority
@@ -148,7 +149,7 @@ class StillWorker:
                 analyzed = self.stage.analyze(*item)
                 self.stage.step(analyzed, now_ns=self.clock())
                 self.failures.works(_PART)
-            except Exception as error:  # noqa: BLE001 - it ends stills for a while, never the flight
+            except FOREIGN as error:  # it ends stills for a while, never the flight
                 self._fail(error)
 
     def _run_requested(self) -> None:
@@ -157,12 +158,12 @@ class StillWorker:
                 if self.stage.outbox.on_demand is not None:
                     self.stage.send_requested(now_ns=self.clock())
                     self.failures.works(_REQUESTED_PART)
-            except Exception as error:  # noqa: BLE001 - it ends one requested still, never the flight
+            except FOREIGN as error:  # it ends one requested still, never the flight
                 _log.debug("a requested still failed", exc_info=error)
                 self.failures.failed(_REQUESTED_PART, f"one was not sent ({type(error).__name__}: {error})")
                 self._given_up.wait(_FAILED_S)
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, error: BaseException) -> None:
         _log.debug("stills failed", exc_info=error)
         with self._lock:
             self._pause.failed(self.clock())

@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+from hvt_common.errors import FOREIGN
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
@@ -229,7 +230,7 @@ class QueuedSink(Generic[T]):
                 if sink.path is not None and sink.path != self.files[-1]:
                     self.files.append(sink.path)
             sink.close(self._hurry)
-        except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on
+        except FOREIGN as error:  # everything else goes on
             if sink is not None:
                 with suppress(Exception):
                     sink.close(_AT_ONCE)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import time
+
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.units import SECOND_NS
 from rigs.examples import Clock
@@ -87,6 +90,13 @@ def test_a_part_that_takes_long_to_fail_has_not_worked_meanwhile():
         detector.run(failing)
         clock.now_ns += SECOND_NS
     assert 8 <= len(opened) <= 13
+
+
+def test_a_part_that_exits_fails_like_one_that_raises():
+    """A plug-in that calls `sys.exit` ended the thread of perception for good: boxes stood, and nothing was said."""
+    failures = Failures(time.time_ns)
+    assert Retried(lambda: None, "detector", failures).run(lambda _part: sys.exit(3)) is None
+    assert [one.reason for one in failures.now] == ["SystemExit: 3"]
 
 
 def test_a_part_that_hangs_is_said_until_it_answers(caplog):

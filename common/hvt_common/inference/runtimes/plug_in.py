@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FOREIGN, UserError
 from hvt_common.inference.letterbox import as_bgr
 from hvt_common.inference.nms import MAX_DETECTIONS
 from hvt_common.runtime.plug_ins import installed, loaded, origin, the_one
@@ -57,9 +57,9 @@ class PlugInDetector:
         self.class_names: tuple[str, ...] = tuple(names) if text else ()
         try:
             if not self.class_names:
-                raise ValueError(f"its class_names are {names!r}, and have to be words")  # noqa: TRY301
+                raise ValueError(f"its class_names are {names!r}, and have to be words")
             self.detect(np.full(_TRIAL, 128, np.uint8))
-        except Exception as error:  # foreign code may raise anything
+        except FOREIGN as error:
             raise UserError(
                 f"{_WHAT} {entry.name!r} of {origin(entry)} does not work: {type(error).__name__}: {error}"
             ) from error
