@@ -126,8 +126,8 @@ def _coco_names_by_id() -> tuple[str, ...]:
 @cache  # once of a file: one that fails in flight is opened again and again
 def _say_unnamed(path: Path, count: int) -> None:
     _log.warning(
-        "%s has no class names: its classes are class 0 to class %d; --labels FILE names them, of hvt-ground "
-        "--detector-labels FILE (FILE may be %s)",
+        "%s has no class names: its classes are class 0 to class %d; --labels FILE (hvt-ground: "
+        "--detector-labels FILE) names them; FILE may be %s",
         path.name,
         count - 1,
         " or ".join(KNOWN_LABELS),

@@ -231,4 +231,4 @@ def test_who_has_a_detector_without_names_is_told_how_each_side_gives_them(
 ) -> None:
     """At the ground ``--labels`` names a classifier's classes: whoever did as told was refused."""
     assert detector_labels(Path("nameless.onnx"), None, "", head="", classes=1, inputs=1) == ("class 0",)
-    assert "--labels FILE names them, of hvt-ground --detector-labels FILE" in caplog.text
+    assert "--labels FILE (hvt-ground: --detector-labels FILE) names them" in caplog.text

@@ -55,7 +55,7 @@ def _all_bad(data: bytes) -> bytes:
         (_cut, "copy", 3),
         (_hole, "copy", 30),
         (_nobodys, None, 2),
-        (_all_bad, None, 103),
+        pytest.param(_all_bad, None, 103, marks=pytest.mark.nightly),
     ],
 )
 def test_the_sdk_is_asked_seldom(data, tmp_path, monkeypatch, damage, read, most):
