@@ -7,7 +7,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
+from weakref import WeakSet
 
 from hvt_common.errors import FOREIGN, NotYetError, UserError
 from hvt_common.redaction import Redaction
@@ -69,11 +70,12 @@ class Failures:
         self._parts: dict[str, Failure] = {}
         self._said: set[str] = set()
         """Parts that the log has reported as failed."""
-        self._checks: list[Callable[[], object]] = []
+        self._watched = WeakSet[Retried[Any]]()
 
-    def watch(self, check: Callable[[], object]) -> None:
-        """Have ``check()`` called before each look at what fails now: it says whether a part hangs."""
-        self._checks.append(check)
+    def watch(self, part: Retried[Any]) -> None:
+        """Ask it before each look at what fails now whether it hangs, for as long as it is there."""
+        with self._lock:
+            self._watched.add(part)
 
     @property
     def parts(self) -> tuple[Failure, ...]:
@@ -82,8 +84,10 @@ class Failures:
 
     @property
     def now(self) -> tuple[FailedPart, ...]:
-        for check in self._checks:
-            check()
+        with self._lock:
+            watched = list(self._watched)
+        for one in watched:
+            one.check()
         return tuple(
             FailedPart(one.part, one.reason, one.since_ns)
             for one in self.parts
@@ -173,13 +177,19 @@ class Retried(Generic[_Part]):
         self._clock = clock
         self._pause = RetryPause()
         self._failed = self._hangs = False
-        self._began_ns: int | None = None
+        self._turns = 0
+        """Begun and ended: odd while it is asked."""
+        self._seen = 0, 0
+        """As many at a former `check`, and when."""
         self._lock = threading.Lock()
-        failures.watch(self._check)
+        failures.watch(self)
 
-    def _check(self) -> None:
-        began_ns = self._began_ns
-        if began_ns is not None and not self._hangs and self._clock() - began_ns > _SILENT_NS:
+    def check(self) -> None:
+        """Say that it hangs, where it does."""
+        turns, now_ns = self._turns, self._clock()
+        if turns != self._seen[0]:
+            self._seen = turns, now_ns
+        elif turns % 2 and not self._hangs and now_ns - self._seen[1] > _SILENT_NS:
             self._hangs = True
             self._failures.failed(self._name, f"no answer for {_SILENT_NS // SECOND_NS} s")
 
@@ -191,7 +201,7 @@ class Retried(Generic[_Part]):
             try:
                 if self._failed:
                     self.part = self._open_part()
-                self._began_ns = self._clock()
+                self._turns += 1
                 answer = use(self.part)
             except FOREIGN as error:
                 self._pause.failed(self._clock(), again=self._failed)
@@ -199,7 +209,7 @@ class Retried(Generic[_Part]):
                 self._failures.failed(self._name, reason_of(error))
                 return None
             finally:
-                self._began_ns = None
+                self._turns += self._turns % 2
             if self._failed or self._hangs:
                 self._failed = self._hangs = False
                 self._failures.works(self._name)
