@@ -334,12 +334,13 @@ def test_hdr_is_as_bright_as_its_white(tmp_path, transfer, pixels):
         stream = container.add_stream("libx265", rate=30)
         stream.width, stream.height, stream.pix_fmt = 128, 128, pixels
         matrix = "bt2020nc" if "yuv" in pixels else "gbr"
+        bright = round(1023 * white) if matrix == "gbr" else round(64 + 876 * white)  # RGB is of full range
         tags = f"colorprim=bt2020:colormatrix={matrix}:transfer={transfer}"
         stream.options = {"x265-params": f"log-level=none:{tags}"}
         for _ in range(3):
             frame = av.VideoFrame(128, 128, pixels)
             for place, plane in enumerate(frame.planes):
-                level = 512 if place and matrix != "gbr" else round(64 + 876 * white)
+                level = 512 if place and matrix != "gbr" else bright
                 plane.update(np.full(plane.buffer_size // 2, level, np.uint16).tobytes())
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
