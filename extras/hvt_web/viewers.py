@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from hvt_ground.report.state import LinkState
 from hvt_web.video.fmp4 import Fragment, Start
 from hvt_web.video.pictures import RUNGS, THUMBNAIL, Made, Rung
 
@@ -159,6 +160,8 @@ class Viewer:
 @dataclass(slots=True)
 class _Stream:
     number: int
+    over: bool = False
+    """Nobody looked any more; the next one who looks begins another."""
     start: tuple[str, bytes] | None = None
     fragments: list[bytes] = field(default_factory=list)
     size_bytes: int = 0
@@ -198,7 +201,7 @@ class EdgePage:
         self.wanted: Mapping[Rung, int] = {}
         """Read by the thread that makes them; another number is another stream, which begins with a start."""
         self.streams: dict[Rung, _Stream] = {}
-        """Kept when nobody looks any more: of an edge that is silent nothing else comes for who looks again."""
+        """Kept when nobody looks any more: of a silent edge nothing else comes for who looks again."""
 
 
 class Hub:
@@ -213,6 +216,7 @@ class Hub:
         self._loads: dict[str, deque[Sequence[float]]] = {}
         self._absent: set[str] = set()
         """Edges that the newest state does not have."""
+        self._silent: set[str] = set()
 
     def post(self, call: Callable[[], None]) -> None:
         """Have it done in the loop's thread; for any thread. After the loop's end nothing is done."""
@@ -279,14 +283,20 @@ class Hub:
         edge.notices.append(message)
         self._to_all(message)
 
-    def state(self, message: str, loads: Mapping[str, Sequence[float]], *, known: frozenset[str]) -> None:
+    def state(
+        self, message: str, loads: Mapping[str, Sequence[float]], *, links: Mapping[str, LinkState]
+    ) -> None:
         """Take the state of all edges; ``loads`` are the points of the plot, and are remembered for newcomers.
 
-        An edge that is not ``known`` any more is forgotten, with its pictures, at the second state without it: one
+        An edge that is not in ``links`` any more is forgotten, with its pictures, at the second state without it: one
         that has just come may not be in the first.
         """
         self._state = message
-        absent = self.edges.keys() - known
+        silent = {edge for edge, link in links.items() if link in ("lost", "ended")}
+        newly, self._silent = silent - self._silent, silent
+        for edge in newly & self.edges.keys():
+            self._show_last(self.edges[edge])
+        absent = self.edges.keys() - links.keys()
         for edge in absent & self._absent:
             del self.edges[edge]
             self._loads.pop(edge, None)
@@ -344,9 +354,15 @@ class Hub:
             if edge.thumbnail is not None:
                 viewer.put_picture(edge.thumbnail)
 
+    def _show_last(self, edge: EdgePage) -> None:
+        # To those who looked again just before it became silent.
+        for rung, stream in edge.streams.items():
+            for viewer in self._watching(edge, rung) if stream.over else ():
+                self._join_stream(viewer, edge, rung)
+
     def _join_stream(self, viewer: Viewer, edge: EdgePage, rung: Rung) -> None:
         stream = edge.streams.get(rung)
-        if stream is None or stream.start is None:
+        if stream is None or stream.start is None or (stream.over and edge.edge not in self._silent):
             return
         for one in stream.start:
             viewer.put(one)
@@ -396,5 +412,7 @@ class Hub:
         wanted: set[Rung] = {rung for rung in RUNGS if self._watching(edge, rung)}
         if any(viewer.wall for viewer in self.viewers):
             wanted.add(THUMBNAIL)
+        for rung, stream in edge.streams.items():
+            stream.over |= rung not in wanted
         self._demands += 1
         edge.wanted = {rung: edge.wanted.get(rung, self._demands) for rung in wanted}

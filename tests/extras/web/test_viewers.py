@@ -199,8 +199,25 @@ def test_a_reload_shows_the_last_picture_of_an_edge_that_is_silent(hub):
     viewer = Viewer()
     hub.join(viewer)
     hub.show_wall(viewer, shown=True)
+    hub.state('{"type": "state"}', {}, links={"uav-1": "lost"})
     hub.watch(viewer, "uav-1", "h264")
     assert {"thumbnail", "overlay"} < set(kinds(viewer))
+
+
+def test_who_looks_again_at_an_edge_that_goes_on_sees_nothing_old(hub):
+    """The picture of an hour ago would stand as the live one until the next keyframe."""
+    edge = flown(hub, frames=3, keyframe_every=10)
+    viewer = Viewer()
+    hub.join(viewer)
+    hub.watch(viewer, "uav-1", "h264")
+    assert "fragment 0" in kinds(viewer), "of a stream that goes on the last keyframe"
+    hub.leave_edge(viewer)
+    hub.watch(viewer, "uav-1", "h264")
+    assert "start" not in kinds(viewer)
+    hub.state('{"type": "state"}', {}, links={"uav-1": "lost"})
+    assert "fragment 2" in kinds(viewer), "it is silent before another stream began"
+    hub.made(edge, Made("h264", Start("avc1.42c01f", b"start")), frame_index=9, captured_ms=0)
+    assert kinds(viewer)[:1] == ["start"]
 
 
 def test_stills_of_the_flight_before_stay_where_an_edge_starts_again(hub):
@@ -216,9 +233,9 @@ def test_edges_that_the_ground_has_left_are_forgotten(hub):
     """Who invents names would fill its memory, and every wall; a newcomer is there before the state knows it."""
     for name in ("gone", "here"):
         hub.begin(EdgePage(name), {"edge": name})
-    hub.state("{}", {"gone": (0, 1.0, 1.0, 1.0)}, known=frozenset({"gone", "here"}))
-    hub.state("{}", {}, known=frozenset({"here"}))
+    hub.state("{}", {"gone": (0, 1.0, 1.0, 1.0)}, links={"gone": "up", "here": "up"})
+    hub.state("{}", {}, links={"here": "up"})
     hub.begin(EdgePage("new"), {"edge": "new"})
     assert hub.edges.keys() == {"gone", "here", "new"}
-    hub.state("{}", {}, known=frozenset({"here"}))
+    hub.state("{}", {}, links={"here": "up"})
     assert hub.edges.keys() == {"here", "new"}
