@@ -50,8 +50,7 @@ def screenshot(recording: Path, *, frame: int, out: Path, size: tuple[int, int] 
             png = _picture(port, recording, frame=frame)
         except ConnectionError:
             raise UserError(
-                f"the viewer ended while it drew {recording}: without a screen it has no letters but Latin, Greek "
-                "and Cyrillic, and no emoji, for names of classes"
+                f"the viewer ended while it drew {recording}; an emoji in a class's name is known to end it"
             ) from None
         finally:
             process.terminate()

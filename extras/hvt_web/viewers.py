@@ -372,7 +372,7 @@ class Hub:
 
     def _fragment(self, edge: EdgePage, rung: Rung, item: Fragment, about: dict[str, Any]) -> None:
         stream = edge.streams.get(rung)
-        if stream is None:
+        if stream is None or stream.over:
             return
         message = packed(
             "fragment",

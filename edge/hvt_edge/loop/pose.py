@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Final, Protocol, cast
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FOREIGN, UserError
 from hvt_common.geodesy import between
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import PoseEncoder
@@ -128,7 +128,7 @@ class PoseStage:
         try:
             pose = self.source.at(media_ns, capture_ns=capture_ns)
             make = None if pose is None else encoder.encode(pose)
-        except Exception as error:  # noqa: BLE001 - what an autopilot says ends no flight, whatever it is
+        except FOREIGN as error:  # what an autopilot says ends no flight, whatever it is
             self.failures.failed(_PART, reason_of(error))
             return
         if make is None:

@@ -11,7 +11,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from hvt_common.errors import FlightError
+from hvt_common.errors import FOREIGN, FlightError
 from hvt_common.protocol.edge_words import FrameGroup
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS, bitrate_text
@@ -228,7 +228,7 @@ class BaseStage:
             unit = self.encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
             if decision.to_link:
                 unit = self._within_a_window(unit, frame, now_ns=now_ns, may_open=not decision.to_store)
-        except Exception as error:
+        except FOREIGN as error:
             if self.open_again is None:
                 raise
             self._recover(error, now_ns=now_ns)
@@ -316,7 +316,7 @@ class BaseStage:
             "lower --size",
         )
 
-    def _recover(self, error: Exception, *, now_ns: int) -> None:
+    def _recover(self, error: BaseException, *, now_ns: int) -> None:
         assert self.open_again is not None, "checked"
         while True:
             self.failures.failed(_PART, f"{self.encoder_name} failed ({error})")
@@ -329,7 +329,7 @@ class BaseStage:
             error.__traceback__ = None  # its frames hold the encoder, and with it its device
             try:
                 self.encoder = self.open_again()
-            except Exception as again:  # noqa: BLE001 - another failure of the same kind
+            except FOREIGN as again:  # another failure of the same kind
                 error = again
                 continue
             self._begins_anew = True

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Self
 
 from hvt_common import __version__
+from hvt_common.errors import FOREIGN
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import (
     BASE_CODEC,
@@ -151,7 +152,7 @@ class EdgeSessions:
             if item is not None:
                 self.handle(item)
             self.housekeep(pending=pending)
-        except Exception as error:  # noqa: BLE001 - it ends one session of one edge, whatever it is
+        except FOREIGN as error:  # it ends one session of one edge, whatever it is
             self._fail(error)
 
     def handle(self, item: Received) -> None:
@@ -384,14 +385,14 @@ class EdgeSessions:
             session.report()
         self.backlog.session_ended(session.info)
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, error: BaseException) -> None:
         # End the session that is open; the next begins with a keyframe, not before the pause is over.
         self._pause.failed(time.monotonic_ns())
         self._say_failed(error, self.session)
         self._end_session()
         self.receiver.stream.decoder_failed()
 
-    def _say_failed(self, error: Exception, session: Session | None) -> None:
+    def _say_failed(self, error: BaseException, session: Session | None) -> None:
         if session is not None:
             if session.failure:
                 return  # one fault may come to light in several places

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 import hvt_web
+from programs.node import needs_node, ran
 
 PLAYER = Path(hvt_web.__file__).parent / "static" / "player.js"
-NODE = shutil.which("node")
 
-pytestmark = pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+pytestmark = needs_node
 
 
-def ran(script: str) -> Any:
+def played(script: str) -> Any:
     """What a script prints that has a ``player``, and ``take`` for a picture of it."""
-    script = f"""
+    return ran(f"""
       globalThis.window = {{}};
       const {{ Player }} = await import({json.dumps(PLAYER.as_uri())});
       let begin = 0;
@@ -32,21 +28,12 @@ def ran(script: str) -> Any:
       const none = new Uint8Array(0);
       const take = (frame) => player.fragment({{ stream: -1, media: frame / 10, frame, captured: frame }}, none);
       {script}
-    """
-    done = subprocess.run(
-        [str(NODE), "--input-type=module", "-e", script],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    """)
 
 
 def test_who_plays_on_after_a_long_pause_sees_the_time_of_the_picture():
     """The picture moved below the time and the boxes of the one at which somebody had paused minutes ago."""
-    found = ran("""
+    found = played("""
       for (let frame = 0; frame < 9000; frame++) take(frame);
       const found = [player.at(5).frame];
       begin = 890;
@@ -58,7 +45,7 @@ def test_who_plays_on_after_a_long_pause_sees_the_time_of_the_picture():
 
 def test_a_pause_that_fills_the_browsers_memory_keeps_the_picture():
     """Who paused in the first ten seconds had single live pictures after some minutes, for good."""
-    said = ran("""
+    said = played("""
       const full = () => { throw new DOMException("", "QuotaExceededError"); };
       player.buffer = { buffered, updating: false, remove() {}, appendBuffer: full };
       player.pause();
@@ -70,4 +57,4 @@ def test_a_pause_that_fills_the_browsers_memory_keeps_the_picture():
 
 def test_who_pauses_single_pictures_plays_on_with_the_newest():
     """The button said Play, and the picture stood still for good."""
-    assert ran("player.pause(); player.play(); console.log(JSON.stringify(player.live));") is True
+    assert played("player.pause(); player.play(); console.log(JSON.stringify(player.live));") is True

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from pathlib import Path
 
-import pytest
-
 import hvt_web
+from programs.node import needs_node, ran
 
 STILLS = Path(hvt_web.__file__).parent / "static" / "stills.js"
-NODE = shutil.which("node")
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_each_object_of_a_line_is_outlined():
     """Of two cars of which the same is to be said the second was nowhere: the line seemed to be about the first."""
-    script = f"""
+    lines = ran(f"""
       const within = (one) => one.children.flatMap((child) => [child, ...within(child)]);
       const element = (kind) => {{
         const one = {{ kind, dataset: {{}}, children: [], addEventListener() {{}}, contains: () => false }};
@@ -35,13 +31,5 @@ def test_each_object_of_a_line_is_outlined():
       for (const x of [1, 5]) stills.add({{ ...still, box: [x, 2, x + 3, 4] }});
       const lines = list.children.map((line) => line.querySelectorAll("rect").map((one) => [one.x, one.width]));
       console.log(JSON.stringify(lines));
-    """
-    done = subprocess.run(
-        [str(NODE), "--input-type=module", "-e", script],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == [[["1", "3"], ["5", "3"]]]
+    """)
+    assert lines == [[["1", "3"], ["5", "3"]]]

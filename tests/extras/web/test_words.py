@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -18,10 +17,10 @@ import pytest
 import hvt_ground
 import hvt_web
 from hvt_common.protocol.edge_words import STILL_WORDS
+from programs.node import needs_node, ran
 
 ROOT = Path(__file__).parents[3]
 STATIC = Path(hvt_web.__file__).parent / "static"
-NODE = shutil.which("node")
 LIVE = {
     "connected": True, "refused": False, "goneMs": 0, "link": "up", "silentMs": 100, "chosen": True, "shown": True,
     "follows": True, "plays": True, "ageMs": 300, "sinceMs": 80, "periodsMs": [100], "lastMs": 300, "lockstep": False,
@@ -39,21 +38,7 @@ def said(calls: list[tuple[str, list]]) -> list:
     )
 
 
-def ran(script: str) -> Any:
-    """What a module of JavaScript prints as JSON."""
-    done = subprocess.run(
-        [NODE, "--input-type=module", "-e", script],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-        env=os.environ | {"TZ": "UTC"},
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_what_is_not_live_never_says_live():
     """An operator would act on a picture of a minute ago."""
     cases = [
@@ -99,7 +84,7 @@ SENTENCES: dict[str, list[tuple[list, Any]]] = json.loads(
 """By name in words.js: what it is given, and what an operator then reads. A new one is written here, and read."""
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_every_sentence_of_the_page_is_read():
     """A word of the code, a hole or a number that nobody knows would stand before who flies."""
     found = ran(
@@ -116,7 +101,7 @@ def test_every_sentence_of_the_page_is_read():
         assert not re.search(r"undefined|null|NaN|\[object|\$\{|_|  ", said), said
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_boxes_go_on_with_their_objects_until_the_next_list_comes():
     """The picture is on the screen before its list: a car of 12 px a frame has left its box by then."""
     smaller = {"id": 1, "box": [2, 1, 18, 9]}  # it grows, and may do so no longer
@@ -137,7 +122,7 @@ def test_boxes_go_on_with_their_objects_until_the_next_list_comes():
     assert boxes == [[[100, 0, 120, 10], parked["box"]], furthest, seen, seen, seen], "it never goes back"
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_a_box_goes_out_of_the_picture_with_its_object():
     """Its name would stand at the rim, and a line where a box was turned inside out."""
     lists = [
@@ -211,7 +196,7 @@ ELEMENTS = """
 """
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_an_edge_that_sends_no_picture_has_no_green_light():
     """A camera that died behind a link that works would look well on the wall."""
     found = ran(
@@ -235,7 +220,7 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
     assert found == [["up", "up 3 s"], silent, silent, ["lost", "lost 12 s"], ["unknown"]]
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_the_plot_draws_no_line_over_what_is_not_known():
     """A minute without a link would be a straight line of bits that nobody sent, and the past would stand as now."""
     found = ran(
@@ -262,7 +247,7 @@ def test_the_plot_draws_no_line_over_what_is_not_known():
     assert found == [["move", 140], ["line", 141], ["line", 142], ["move", 200], ["line", 201]]
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+@needs_node
 def test_names_give_way_and_what_was_not_seen_in_this_picture_is_faint():
     """On a crowded car park nobody could read a name, or see a car under one; old boxes would pass for new ones."""
     found = ran(
