@@ -176,7 +176,7 @@ def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Pat
         # Not before: a tuple that another thread is still making must not be seen.
         alive = sum(isinstance(one, Session) for one in gc.get_objects())
     assert len(ended) == SESSIONS
-    assert not any(ended)
+    assert not any(ended), [one for one in ended if one]
     assert len(list(tmp_path.glob("*.rrd"))) == SESSIONS
     assert alive <= 2, "the one that is open, and the one before it in the edge's hands"
     stays(*held)
