@@ -1,27 +1,32 @@
 """Of a recording that may be damaged: what the SDK can read, told without reading it in this process.
 
-On some damage the SDK does not raise: it ends its process. So a child forks for each try; to start it takes
-as long as to import Rerun.
+On some damage the SDK does not raise: it ends its process. So a process forks for each try. To start it takes as
+long as to import Rerun: it stays for the next file, and ends with this process or after some seconds without one.
 """
 
 from __future__ import annotations
 
+import atexit
+import json
 import os
 import resource
+import select
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from hvt_ground.sinks.rerun.rrd_file import STREAM_HEADER_BYTES, id_of, open_rrd, whole_messages
 
 _STORE_INFO = 1
-_WHOLE, _COPIED, _NOTHING = 0, 10, 11
+_WHOLE, _COPIED, _NOTHING = b"0", b"1", b"2"
 _FOOT_BYTES = 32
 """Between the last message of a recording and its end."""
 _TRIES = 100
-_TRY_S, _PATIENCE_S = 60, 600.0
+_TRY_S, _PATIENCE_S, _IDLE_S = 60, 600.0, 10.0
 
 _Span = tuple[int, int]
 """Where a message begins and ends."""
@@ -32,19 +37,53 @@ def readable(path: Path, out: Path) -> Path | None:
 
     After a power cut a file breaks off or ends in zeros, and cards lose bits.
     """
-    command = [sys.executable, "-P", "-m", __name__, str(path), str(out)]
-    try:
-        done = subprocess.run(  # noqa: S603
-            command,
-            check=False,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            timeout=_PATIENCE_S,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return {_WHOLE: path, _COPIED: out}.get(done.returncode)
+    with _one_at_a_time:
+        try:
+            answer = _tries.asked(path, out) or _tries.asked(path, out)  # it may just have ended
+        except OSError:
+            return None
+    return {_WHOLE: path, _COPIED: out}.get(answer)
+
+
+class _Tries:
+    """The process that tries what can be read."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        atexit.register(self.end)
+
+    def asked(self, path: Path, out: Path) -> bytes:
+        """What it found, nothing if it ended; `OSError` where it does not start, or finds nothing in ten minutes."""
+        answer = b""
+        try:
+            process = self._process = self._process or _started()
+            if process.stdin and process.stdout:
+                with suppress(BrokenPipeError):
+                    process.stdin.write(
+                        json.dumps([str(path.absolute()), str(out.absolute())]).encode() + b"\n"
+                    )
+                if not select.select([process.stdout], [], [], _PATIENCE_S)[0]:
+                    raise TimeoutError
+                answer = process.stdout.read(1)
+        finally:
+            if not answer:
+                self.end()
+        return answer
+
+    def end(self) -> None:
+        process, self._process = self._process, None
+        if process:
+            process.kill()
+            with process:
+                pass
+
+
+def _started() -> subprocess.Popen[bytes]:
+    command, pipe = [sys.executable, "-P", "-m", __name__], subprocess.PIPE
+    return subprocess.Popen(command, bufsize=0, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL)  # noqa: S603
+
+
+_one_at_a_time, _tries = threading.Lock(), _Tries()
 
 
 def has_holes(path: Path, copy: Path) -> bool:
@@ -70,8 +109,18 @@ def _next_recording(path: Path) -> int:
     return end + place if end and place >= 0 else 0
 
 
-def main(path: Path, out: Path) -> int:
-    """The child's part; what it found is its exit code."""
+def main() -> None:
+    """Answer the names of a file and of its copy, a line each time, with what was found."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    answers = os.dup(1)
+    os.dup2(2, 1)
+    with os.fdopen(0, "rb", buffering=0) as questions:
+        while select.select([questions], [], [], _IDLE_S)[0] and (line := questions.readline()):
+            os.write(answers, tried(*map(Path, json.loads(line))))
+
+
+def tried(path: Path, out: Path) -> bytes:
+    """What `readable` finds, in a process that the SDK may end in a fork."""
     if _reads(path):
         return _WHOLE
     with path.open("rb") as file:
@@ -131,5 +180,4 @@ def _reads(path: Path, *, least: int = 1) -> bool:
 
 
 if __name__ == "__main__":
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    raise SystemExit(main(*map(Path, sys.argv[1:])))
+    main()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import subprocess
 
 import pytest
 import rerun as rr
 
-from hvt_ground.sinks.rerun.readable import main, readable
+from hvt_ground.sinks.rerun.readable import _Tries, readable, tried
 from programs.rrd import damaged
 
 ROWS = 300
@@ -65,7 +66,25 @@ def test_the_sdk_is_asked_seldom(data, tmp_path, monkeypatch, damage, read, most
     tries = []
     fork = os.fork
     monkeypatch.setattr(os, "fork", lambda: tries.append(1) or fork())
-    code = main(path, out)
+    found = tried(path, out)
     assert len(tries) <= most
-    assert {0: "whole", 10: "copy", 11: None}[code] == read
+    assert {b"0": "whole", b"1": "copy", b"2": None}[found] == read
     assert readable(path, out) == {"whole": path, "copy": out, None: None}[read]
+
+
+def test_who_tries_stays_for_the_next_file(data, tmp_path, monkeypatch):
+    """Each file of a folder would take as long as to import Rerun. One that was killed is replaced."""
+    path, starts = tmp_path / "whole.rrd", []
+    path.write_bytes(data)
+    popen = subprocess.Popen
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *words, **how: starts.append(popen(*words, **how)) or starts[-1]
+    )
+    tries = _Tries()
+    assert [tries.asked(path, tmp_path / "copy.rrd") for _ in range(3)] == [b"0"] * 3
+    assert len(starts) == 1
+    starts[0].kill()
+    assert b"0" in (tries.asked(path, tmp_path / "copy.rrd"), tries.asked(path, tmp_path / "copy.rrd"))
+    tries.end()
+    assert len(starts) == 2
+    assert all(one.poll() is not None for one in starts)
