@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -15,7 +16,7 @@ from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement,
 from hvt_ground.report.state import EdgeState, GroundState, SessionState
 from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.palette import class_colour
-from hvt_web.video.pictures import Pictures, jpeg
+from hvt_web.video.pictures import Made, Pictures, jpeg
 from hvt_web.viewers import EdgePage, Hub, text
 
 _LATE_NS = 300_000_000
@@ -51,6 +52,7 @@ class SessionFeed(SinkWriter[Event]):
             "budget": info.budget_bps,
             "software": info.software,
         }
+        page.last = self._last
         hub.post(partial(hub.begin, page, session))
 
     def log(self, item: Event) -> None:
@@ -74,18 +76,30 @@ class SessionFeed(SinkWriter[Event]):
         """Pictures may be missing."""
         self._pictures.gap()
 
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - nothing takes long
+        """The last picture stays at hand."""
+        self._pictures.close()
+
     def _video(self, sample: VideoSample) -> None:
         now_ns, wanted = self._clock(), self._page.wanted
         if self._late_ns > _TOO_LATE_NS and not sample.keyframe:
             self._pictures.gap()
             self._want_keyframe(bool(wanted), now_ns)
             return
+        self._page.newest = sample.frame_index
         made = self._pictures.add(sample, wanted=wanted, now_ns=now_ns, hurry=self._late_ns > _LATE_NS)
+        self._give(sample, made)
+        self._want_keyframe(self._pictures.waits, now_ns)
+
+    def _last(self) -> None:
+        for sample, made in self._pictures.last():
+            self._give(sample, made)
+
+    def _give(self, sample: VideoSample, made: Iterable[Made]) -> None:
         captured_ms = self._captured_ms(sample.capture_ns)
         for one in made:
             give = partial(self._hub.made, self._page, one)
             self._hub.post(partial(give, frame_index=sample.frame_index, captured_ms=captured_ms))
-        self._want_keyframe(self._pictures.waits, now_ns)
 
     def _want_keyframe(self, waits: bool, now_ns: int) -> None:  # noqa: FBT001 - two callers
         # An edge may make none by itself (--keyframe-interval 0).

@@ -148,8 +148,8 @@ class WebPage(Service):
     def show(self, state: GroundState) -> None:
         """Give out how all edges are; for any thread."""
         message, loads = state_message(state), state_loads(state)
-        links = {one.edge: one.link for one in state.edges}
-        self._hub.post(lambda: self._hub.state(message, loads, links=links))
+        known = frozenset(one.edge for one in state.edges)
+        self._hub.post(lambda: self._hub.state(message, loads, known=known))
 
     def __enter__(self) -> Self:
         self._thread.start()

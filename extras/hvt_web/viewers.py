@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from hvt_ground.report.state import LinkState
+from hvt_common.runtime.process import lower_priority
 from hvt_web.video.fmp4 import Fragment, Start
 from hvt_web.video.pictures import RUNGS, THUMBNAIL, Made, Rung
 
@@ -160,8 +161,6 @@ class Viewer:
 @dataclass(slots=True)
 class _Stream:
     number: int
-    over: bool = False
-    """Nobody looked any more; the next one who looks begins another."""
     start: tuple[str, bytes] | None = None
     fragments: list[bytes] = field(default_factory=list)
     size_bytes: int = 0
@@ -196,12 +195,18 @@ class EdgePage:
         self.stills: deque[str] = deque(maxlen=_MOST_STILLS)
         self.notices: deque[str] = deque(maxlen=_MOST_NOTICES)
         self.pictures = StillPictures()
-        self.thumbnail: bytes | None = None
+        self.singles: dict[Rung, tuple[int, bytes]] = {}
+        """The last JPEG and the last thumbnail, each with its frame."""
         self.overlay = ""  # the last boxes: of a silent edge no others come
         self.wanted: Mapping[Rung, int] = {}
         """Read by the thread that makes them; another number is another stream, which begins with a start."""
         self.streams: dict[Rung, _Stream] = {}
-        """Kept when nobody looks any more: of a silent edge nothing else comes for who looks again."""
+        self.newest = -1
+        """The frame that came last; written by that thread."""
+        self.last: Callable[[], None] = lambda: None
+        """Make single pictures of it, where nobody looked as it came; for a thread of its own."""
+        self.came = self.sought = -1
+        """The newest frame at the last state, and the one of which single pictures were made so."""
 
 
 class Hub:
@@ -216,7 +221,7 @@ class Hub:
         self._loads: dict[str, deque[Sequence[float]]] = {}
         self._absent: set[str] = set()
         """Edges that the newest state does not have."""
-        self._silent: set[str] = set()
+        self._one_last = threading.Lock()
 
     def post(self, call: Callable[[], None]) -> None:
         """Have it done in the loop's thread; for any thread. After the loop's end nothing is done."""
@@ -240,15 +245,18 @@ class Hub:
         self._want(edge)
 
     def made(self, edge: EdgePage, made: Made, *, frame_index: int, captured_ms: float) -> None:
-        """Give out a start, a fragment, a JPEG or a thumbnail."""
+        """Give out a start, a fragment, a JPEG or a thumbnail, but not of a session that is over."""
+        if self.edges.get(edge.edge) is not edge:
+            return
         rung, item = made.rung, made.item
         about = {"edge": edge.edge, "frame": frame_index, "captured": round(captured_ms, 1)}
         if rung == THUMBNAIL:
             assert isinstance(item, bytes)
-            edge.thumbnail = packed("thumbnail", item, **about)
+            message = packed("thumbnail", item, **about)
+            edge.singles[rung] = (frame_index, message)
             for viewer in self.viewers:
                 if viewer.wall:
-                    viewer.put_picture(edge.thumbnail)
+                    viewer.put_picture(message)
             return
         if isinstance(item, Start):
             self._streams += 1
@@ -263,7 +271,8 @@ class Hub:
             self._fragment(edge, rung, item, about)
         else:
             message = packed("jpeg", item, **about)
-            for viewer in self._watching(edge, rung):
+            edge.singles[rung] = (frame_index, message)
+            for viewer in self._watching(edge, *(set(RUNGS) - edge.streams.keys())):
                 viewer.put_video(message, begins=True)
 
     def overlay(self, edge: EdgePage, message: str) -> None:
@@ -283,20 +292,14 @@ class Hub:
         edge.notices.append(message)
         self._to_all(message)
 
-    def state(
-        self, message: str, loads: Mapping[str, Sequence[float]], *, links: Mapping[str, LinkState]
-    ) -> None:
+    def state(self, message: str, loads: Mapping[str, Sequence[float]], *, known: frozenset[str]) -> None:
         """Take the state of all edges; ``loads`` are the points of the plot, and are remembered for newcomers.
 
-        An edge that is not in ``links`` any more is forgotten, with its pictures, at the second state without it: one
+        An edge that is not ``known`` any more is forgotten, with its pictures, at the second state without it: one
         that has just come may not be in the first.
         """
         self._state = message
-        silent = {edge for edge, link in links.items() if link in ("lost", "ended")}
-        newly, self._silent = silent - self._silent, silent
-        for edge in newly & self.edges.keys():
-            self._show_last(self.edges[edge])
-        absent = self.edges.keys() - links.keys()
+        absent = self.edges.keys() - known
         for edge in absent & self._absent:
             del self.edges[edge]
             self._loads.pop(edge, None)
@@ -304,6 +307,9 @@ class Hub:
         for edge, load in loads.items():
             self._loads.setdefault(edge, deque(maxlen=_MOST_LOADS)).append(load)
         self._to_all(message)
+        for page in self.edges.values():
+            self._show_last(page)
+            page.came = page.newest
 
     # From the viewers
 
@@ -351,28 +357,41 @@ class Hub:
     def _put_thumbnails(self, viewer: Viewer) -> None:
         # Those of all edges: of a silent one no other would come.
         for edge in self.edges.values() if viewer.wall else ():
-            if edge.thumbnail is not None:
-                viewer.put_picture(edge.thumbnail)
+            if THUMBNAIL in edge.singles:
+                viewer.put_picture(edge.singles[THUMBNAIL][1])
 
     def _show_last(self, edge: EdgePage) -> None:
-        # To those who looked again just before it became silent.
-        for rung, stream in edge.streams.items():
-            for viewer in self._watching(edge, rung) if stream.over else ():
-                self._join_stream(viewer, edge, rung)
+        # Where frames have ceased and somebody looks: what he saw was empty, or of when somebody last looked.
+        needed: set[Rung] = {"jpeg" if rung in RUNGS else rung for rung in edge.wanted.keys() - edge.streams}
+        newest = edge.newest
+        if newest in (-1, edge.sought) or newest != edge.came:
+            return
+        if all(edge.singles.get(rung, (-1,))[0] == newest for rung in needed):
+            return
+        edge.sought = newest
+
+        def make() -> None:
+            lower_priority()
+            with self._one_last:
+                edge.last()
+
+        threading.Thread(target=make, name="hvt-web-last", daemon=True).start()
 
     def _join_stream(self, viewer: Viewer, edge: EdgePage, rung: Rung) -> None:
         stream = edge.streams.get(rung)
-        if stream is None or stream.start is None or (stream.over and edge.edge not in self._silent):
-            return
-        for one in stream.start:
-            viewer.put(one)
-        viewer.begin_video(stream.fragments)
+        frame, single = edge.singles.get("jpeg", (-1, b""))
+        if stream is not None and stream.start is not None:
+            for one in stream.start:
+                viewer.put(one)
+            viewer.begin_video(stream.fragments)
+        elif frame == edge.newest >= 0:
+            viewer.put_video(single, begins=True)
         if edge.overlay:
             viewer.put_video(edge.overlay, begins=False)
 
     def _fragment(self, edge: EdgePage, rung: Rung, item: Fragment, about: dict[str, Any]) -> None:
         stream = edge.streams.get(rung)
-        if stream is None or stream.over:
+        if stream is None:
             return
         message = packed(
             "fragment",
@@ -412,7 +431,8 @@ class Hub:
         wanted: set[Rung] = {rung for rung in RUNGS if self._watching(edge, rung)}
         if any(viewer.wall for viewer in self.viewers):
             wanted.add(THUMBNAIL)
-        for rung, stream in edge.streams.items():
-            stream.over |= rung not in wanted
+        for rung in edge.streams.keys() - wanted:
+            del edge.streams[rung]  # the next one who looks begins another
         self._demands += 1
         edge.wanted = {rung: edge.wanted.get(rung, self._demands) for rung in wanted}
+        self._show_last(edge)

@@ -103,12 +103,25 @@ class Pictures:
             return
         yield from self._coded(picture, sample, wanted=wanted, now_ns=now_ns)
 
+    def last(self) -> Iterator[tuple[VideoSample, tuple[Made, ...]]]:
+        """The newest sample as single pictures, where all since its keyframe is there; for any thread."""
+        picture, gop = None, tuple(self._gop)
+        decoder = BaseDecoder(size=self._info.base_size)
+        for one in gop:
+            picture = decoder.decode_yuv(one.data)
+        if picture is not None:
+            yield gop[-1], (Made("jpeg", jpeg(_bgr(picture.frame))), _thumbnail(picture.frame))
+
     def gap(self) -> None:
         """Samples are missing: the next that is of use is a keyframe."""
         self._gop.clear()
         self._gop_bytes = 0
         self._whole = False
         self._copied = self._decoder = None
+
+    def close(self) -> None:
+        """Keep what `last` needs alone."""
+        self._copied = self._decoder = self._h264 = None
 
     def _remember(self, sample: VideoSample) -> bool:
         if sample.keyframe:
@@ -162,9 +175,7 @@ class Pictures:
         if "jpeg" in wanted and self._due("jpeg", now_ns, _JPEG_EVERY_NS):
             yield Made("jpeg", jpeg(_bgr(picture)))
         if THUMBNAIL in wanted and self._due(THUMBNAIL, now_ns, _THUMBNAIL_EVERY_NS):
-            width = min(_THUMBNAIL_WIDTH_PX, picture.width)
-            height = max(2, round(picture.height * width / picture.width))
-            yield Made(THUMBNAIL, jpeg(_bgr(picture, width, height), quality_pct=70))
+            yield _thumbnail(picture)
 
     def _due(self, rung: Rung, now_ns: int, every_ns: int) -> bool:
         if now_ns < self._due_ns.get(rung, 0):
@@ -214,6 +225,12 @@ def _encoder(info: Info) -> VideoCodecContext:
     encoder.color_range = ColorRange.MPEG
     encoder.options = _X264 | {"g": "100000"}  # keyframes come by capture time
     return encoder
+
+
+def _thumbnail(picture: av.VideoFrame) -> Made:
+    width = min(_THUMBNAIL_WIDTH_PX, picture.width)
+    height = max(2, round(picture.height * width / picture.width))
+    return Made(THUMBNAIL, jpeg(_bgr(picture, width, height), quality_pct=70))
 
 
 def _bgr(picture: av.VideoFrame, width: int | None = None, height: int | None = None) -> Image:

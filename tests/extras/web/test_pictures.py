@@ -131,6 +131,20 @@ def test_single_pictures_come_twice_a_second_and_thumbnails_once(samples):
     assert cv2.imdecode(np.frombuffer(jpegs[-1], np.uint8), cv2.IMREAD_COLOR).shape == (SIZE[1], SIZE[0], 3)
 
 
+def test_the_last_picture_is_made_for_who_comes_after_it(samples):
+    """The page of an edge that nobody had looked at was empty during an outage."""
+    made = pictures()
+    fed(made, samples[:20], set())
+    made.close()
+    [(sample, (single, thumbnail))] = made.last()
+    assert (sample, single.rung, thumbnail.rung) == (samples[19], "jpeg", "thumbnail")
+    assert isinstance(single.item, bytes)
+    shown_last = cv2.imdecode(np.frombuffer(single.item, np.uint8), cv2.IMREAD_COLOR)
+    assert place(shown_last) == pytest.approx(19 * STEP_PX, abs=2)
+    made.gap()
+    assert not list(made.last()), "a picture without its keyframe would be grey"
+
+
 def test_after_a_gap_nothing_comes_before_the_keyframe(samples):
     """The page would show a broken picture."""
     made = pictures()

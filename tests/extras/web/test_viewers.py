@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import Iterator
 
 import pytest
 
 from hvt_web.video.fmp4 import Fragment, Start
 from hvt_web.video.pictures import Made
-from hvt_web.viewers import EdgePage, Hub, StillPictures, Viewer, packed
+from hvt_web.viewers import EdgePage, Hub, StillPictures, Viewer
 
 
 def fragment(number: int, *, keyframe: bool = False, size: int = 10) -> Made:
@@ -190,18 +191,45 @@ def test_few_long_words_are_too_much_too():
     assert viewer.empty
 
 
-def test_a_reload_shows_the_last_picture_of_an_edge_that_is_silent(hub):
-    """The wall would have a black tile for the very edge that was lost, and "no boxes yet" would stand for good."""
-    hub.overlay(flown(hub, frames=3, keyframe_every=10), '{"type": "overlay"}')
-    lost = EdgePage("lost")
-    hub.begin(lost, {"edge": "lost"})
-    lost.thumbnail = packed("thumbnail", b"x", edge="lost")
-    viewer = Viewer()
-    hub.join(viewer)
-    hub.show_wall(viewer, shown=True)
-    hub.state('{"type": "state"}', {}, links={"uav-1": "lost"})
-    hub.watch(viewer, "uav-1", "h264")
-    assert {"thumbnail", "overlay"} < set(kinds(viewer))
+def ceased(hub: Hub, edge: EdgePage, frame: int) -> None:
+    """Its frames end with this one, of which single pictures can be made."""
+
+    def last() -> None:
+        for rung in ("jpeg", "thumbnail"):
+            hub.made(edge, Made(rung, b"picture"), frame_index=frame, captured_ms=0)
+
+    edge.newest, edge.last = frame, last
+    for _ in range(2):
+        hub.state('{"type": "state"}', {}, known=frozenset({"uav-1"}))
+    made()
+
+
+def made() -> None:
+    """Wait for the pictures that are being made."""
+    for one in threading.enumerate():
+        if one.name == "hvt-web-last":
+            one.join()
+
+
+def test_who_comes_during_an_outage_sees_the_last_picture(hub):
+    """The page was black for the very edge that was lost, or showed it as when somebody had last looked."""
+    edge = flown(hub, frames=3, keyframe_every=10)
+    hub.overlay(edge, '{"type": "overlay"}')
+    assert not [one.name for one in threading.enumerate() if one.name == "hvt-web-last"], "nobody looks"
+    ceased(hub, edge, 90)
+    first, second = Viewer(), Viewer()
+    for viewer in (first, second):
+        hub.join(viewer)
+        hub.show_wall(viewer, shown=True)
+        hub.watch(viewer, "uav-1", "h264")
+        made()
+    assert {"jpeg", "overlay", "thumbnail"} < set(kinds(second))
+    assert {"jpeg", "overlay", "thumbnail"} < set(kinds(first))
+    hub.made(edge, Made("h264", Start("avc1.42c01f", b"start")), frame_index=91, captured_ms=0)
+    edge.newest = 91
+    third = Viewer()
+    hub.watch(third, "uav-1", "hevc")
+    assert "jpeg" not in kinds(third), "it is old by now"
 
 
 def test_who_looks_again_at_an_edge_that_goes_on_sees_nothing_old(hub):
@@ -215,8 +243,8 @@ def test_who_looks_again_at_an_edge_that_goes_on_sees_nothing_old(hub):
     hub.watch(viewer, "uav-1", "h264")
     hub.made(edge, fragment(3), frame_index=3, captured_ms=0)  # on its way when nobody looked any more
     assert not {"start", "fragment 3"} & set(kinds(viewer))
-    hub.state('{"type": "state"}', {}, links={"uav-1": "lost"})
-    assert "fragment 2" in kinds(viewer), "it is silent before another stream began"
+    ceased(hub, edge, 3)
+    assert "jpeg" in kinds(viewer), "it is silent before another stream began"
     hub.made(edge, Made("h264", Start("avc1.42c01f", b"start")), frame_index=9, captured_ms=0)
     assert kinds(viewer)[:1] == ["start"]
 
@@ -234,9 +262,9 @@ def test_edges_that_the_ground_has_left_are_forgotten(hub):
     """Who invents names would fill its memory, and every wall; a newcomer is there before the state knows it."""
     for name in ("gone", "here"):
         hub.begin(EdgePage(name), {"edge": name})
-    hub.state("{}", {"gone": (0, 1.0, 1.0, 1.0)}, links={"gone": "up", "here": "up"})
-    hub.state("{}", {}, links={"here": "up"})
+    hub.state("{}", {"gone": (0, 1.0, 1.0, 1.0)}, known=frozenset({"gone", "here"}))
+    hub.state("{}", {}, known=frozenset({"here"}))
     hub.begin(EdgePage("new"), {"edge": "new"})
     assert hub.edges.keys() == {"gone", "here", "new"}
-    hub.state("{}", {}, links={"here": "up"})
+    hub.state("{}", {}, known=frozenset({"here"}))
     assert hub.edges.keys() == {"here", "new"}
