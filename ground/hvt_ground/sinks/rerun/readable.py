@@ -39,7 +39,7 @@ def readable(path: Path, out: Path) -> Path | None:
     """
     with _one_at_a_time:
         try:
-            answer = _tries.asked(path, out) or _tries.asked(path, out)  # it may just have ended
+            answer = _tries.answer(path, out) or _tries.answer(path, out)  # it may just have ended
         except OSError:
             return None
     return {_WHOLE: path, _COPIED: out}.get(answer)
@@ -52,9 +52,9 @@ class _Tries:
         self._process: subprocess.Popen[bytes] | None = None
         atexit.register(self.end)
 
-    def asked(self, path: Path, out: Path) -> bytes:
+    def answer(self, path: Path, out: Path) -> bytes:
         """What it found, nothing if it ended; `OSError` where it does not start, or finds nothing in ten minutes."""
-        answer = b""
+        found = b""
         try:
             process = self._process = self._process or _started()
             if process.stdin and process.stdout:
@@ -64,11 +64,11 @@ class _Tries:
                     )
                 if not select.select([process.stdout], [], [], _PATIENCE_S)[0]:
                     raise TimeoutError
-                answer = process.stdout.read(1)
+                found = process.stdout.read(1)
         finally:
-            if not answer:
+            if not found:
                 self.end()
-        return answer
+        return found
 
     def end(self) -> None:
         process, self._process = self._process, None
