@@ -14,7 +14,7 @@ def program(refused, pictures, free_port):
     """Refuse settings of either program, on top of a run that would otherwise work."""
     common = {
         "hvt-edge": ["--source", pictures, "--size", "96x64", "--connect", f"tcp/127.0.0.1:{free_port}"],
-        "hvt-ground": ["--listen", f"tcp/127.0.0.1:{free_port}", "--once", "--wait", "1s"],
+        "hvt-ground": ["--listen", f"tcp/127.0.0.1:{free_port}", "--once", "--wait", "60s"],
     }
 
     def program(name: str, *settings: str) -> str:
