@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
 
+from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.tiles import detect_whole
-from hvt_common.runtime.failures import Retried
+from hvt_common.runtime.failures import Failures, Retried
 from hvt_common.values import Detections, Image, Posterior
 
+_Model = TypeVar("_Model", bound=Detector | Classifier)
 
-class RetriedDetector(Retried[Detector]):
+
+class _RetriedModel(Retried[_Model], Generic[_Model]):
+    # Its numbers mean the names that it began with: a file with others, put in its place meanwhile, does not run.
+
+    def __init__(
+        self, open_part: Callable[[], _Model], name: str, failures: Failures, **settings: Any
+    ) -> None:
+        self.class_names: tuple[str, ...] = ()
+
+        def open_same() -> _Model:
+            part = open_part()
+            if self.class_names and part.class_names != self.class_names:
+                raise UserError(f"the {name} is another now, with other class names: a new start takes it")
+            return part
+
+        super().__init__(open_same, name, failures, **settings)
+        self.class_names = self.part.class_names
+
+
+class RetriedDetector(_RetriedModel[Detector]):
     """A `FailingDetector`: it finds None while its model fails."""
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        return self.part.class_names
 
     def detect(self, image_bgr: Image) -> Detections | None:
         return self.run(lambda model: model.detect(image_bgr))
@@ -25,12 +43,8 @@ class RetriedDetector(Retried[Detector]):
         return self.run(lambda model: detect_whole(model, image_bgr))
 
 
-class RetriedClassifier(Retried[Classifier]):
+class RetriedClassifier(_RetriedModel[Classifier]):
     """Has no opinion while its model fails."""
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        return self.part.class_names
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
         return self.run(lambda model: model.classify(crops_bgr)) or []

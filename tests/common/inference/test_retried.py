@@ -45,3 +45,27 @@ def test_a_model_whose_run_raises_is_opened_again_with_growing_pauses(tmp_path, 
     now_ns[0] = 80 * SECOND_NS
     assert detector.detect(DARK) is None
     assert "model.onnx" in failures.parts[0].reason, "it cannot be opened either"
+
+
+def test_a_file_with_other_classes_is_not_taken_in_flight(tmp_path):
+    """Put in place of one that failed, it gave its numbers the names that the flight had begun with."""
+    path, now_ns = failing_in_the_light(tmp_path / "model.onnx"), [0]
+    failures = Failures(lambda: now_ns[0])
+    (tmp_path / "names.txt").write_text("red\ngreen\nblue\n")
+
+    def open_one():
+        return open_detector(str(path), labels=tmp_path / "names.txt")
+
+    detector = RetriedDetector(open_one, "detector", failures, clock=lambda: now_ns[0])
+    assert detector.detect(BRIGHT) is None
+    (tmp_path / "names.txt").write_text("blue\ngreen\nred\n")
+    now_ns[0] = 10 * SECOND_NS
+    assert detector.detect(DARK) is None
+    assert (
+        failures.parts[0].reason
+        == "the detector is another now, with other class names: a new start takes it"
+    )
+    assert detector.class_names == ("red", "green", "blue")
+    (tmp_path / "names.txt").write_text("red\ngreen\nblue\n")
+    now_ns[0] = 100 * SECOND_NS
+    assert detector.detect(DARK) is not None
