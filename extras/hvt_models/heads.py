@@ -31,6 +31,7 @@ from hvt_models.forms import Corners, Dense, Listed, Parallel, PerQuery
 _ANCHORS_A_CELL = 3
 """Anchors a cell of YOLOv5 and YOLOv7."""
 _BOX = 4
+_ADDS_UP = 1e-2
 
 _RGB_1 = Preparation(mean=(0.0,) * 3, scale=(1 / 255,) * 3)
 _RGB_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3)
@@ -243,10 +244,13 @@ def _rt_detr(trial: Trial) -> Match | None:
         return None
     logits = not are_probabilities(table)
     words = " ".join(trial.ports[index].name.lower() for index in pair)
-    # Of a softmax over "no object" the greatest logit is positive everywhere, on grey too.
+    # Of a softmax over "no object" the greatest logit is positive everywhere, on grey too; and its scores add up.
     grey = rows_of(trial.runs[0][pair[1]].astype(np.float32))
-    sigmoid = not logits or float((grey.max(axis=1) > 0).mean()) < 0.5
-    decided = trial.relative(boxes) and (logits or "logit" in words or _shows_centres(_shown(boxes)))
+    sure = grey.max(axis=1, initial=0) > 0 if logits else abs(table.sum(axis=1) - 1) < _ADDS_UP
+    sigmoid = float(np.mean(sure)) < 0.5
+    shown = _shown(boxes)
+    said = (logits or "logit" in words) and not _are_corners(shown)
+    decided = trial.relative(boxes) and (said or _shows_centres(shown))
     proof = f"boxes by their centre in 0…1 and {'logits' if logits else 'scores'}, a row a query"
     found = Match(
         pair,

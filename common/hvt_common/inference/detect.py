@@ -14,9 +14,11 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of
 from hvt_common.inference.heads.choose import HEAD_NAMES, Trial, check_head_name, choose_head, trial_pictures
+from hvt_common.inference.heads.contract import is_like
 from hvt_common.inference.labels import (
     USUAL_CONFIDENCE,
     class_labels,
+    counts_from_one,
     default_confidence,
     detector_labels,
     read_labels,
@@ -209,7 +211,7 @@ class OnnxDetector:
             inputs=len(model.inputs),
         )
         self._group_ids = _group_ids(self.class_names)
-        self._beyond_said = False
+        self._are_names, self._beyond_said = names is not None, False
         self._letterboxer = Letterboxer(
             anchor=self.head.anchor,
             preparation=self.preparation,
@@ -236,10 +238,18 @@ class OnnxDetector:
         tensor, letterbox = self._letterboxer.fill(image, input_size)
         least = min(self._confidence, WEAK) if self._averages else self._confidence
         outputs = self._run(tensor)
-        found = self.head.decode(outputs, confidence=least, input_size=input_size)
+        try:
+            found = self.head.decode(outputs, confidence=least, input_size=input_size)
+        except UserError as error:
+            raise UserError(f"model {self.model.path} {error}") from None
         used = [outputs[index] for index in self.head.outputs]
         if not len(found.scores) and any(np.isnan(one).sum() > _BROKEN * one.size for one in used):
             raise UserError(f"model {self.model.path} answers a picture with what is no number (NaN)")
+        if not len(found.scores) and found.beyond:
+            raise UserError(
+                f"model {self.model.path} answers a picture with confidences above 1: it is not {self.head.name},"
+                " or is broken"
+            )
         if self.head.suppresses:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids
@@ -254,6 +264,11 @@ class OnnxDetector:
         boxes = letterbox.to_image(boxes)
         class_ids = found.class_ids[selected]
         named = class_ids < len(self.class_names)
+        if self._are_names and not named.all() and counts_from_one(self.head.name):
+            raise UserError(
+                f"model {self.model.path} lists class {class_ids.max()}, and has names of class 0 to class"
+                f" {len(self.class_names) - 1}: the names are of other numbers; --labels names all, a background too"
+            )
         if not named.all() and not self._beyond_said:
             self._beyond_said = True
             _log.warning(
@@ -333,7 +348,25 @@ class OnnxDetector:
             if not top or all(_is_finite(output) for output in outputs):
                 runs.append(outputs)
                 tops.append(top)
-        return Trial(self.model.outputs, runs, tops, size, self.model.metadata, names)
+        return Trial(
+            self.model.outputs, _of_one_form(self.model, runs), tops, size, self.model.metadata, names
+        )
+
+
+def _of_one_form(model: OnnxModel, runs: list[list[npt.NDArray[Any]]]) -> list[list[npt.NDArray[Any]]]:
+    # Where nothing is found some networks write an empty output of another form: here none of the usual one.
+    usual = next((run for run in runs if all(one.size for one in run)), runs[0])
+    boxed = {one.shape[:-1] for one in usual if one.shape[-1:] == (4,)}
+    for run in runs:
+        for index, (one, first) in enumerate(zip(run, usual, strict=True)):
+            if is_like(one.shape, first.shape):
+                continue
+            if one.size or not first.ndim:
+                said = f"it answers one picture with {first.shape}, another with {one.shape}"
+                raise UserError(_not_a_detector(model, said))
+            listed = first.ndim < 2 or first.shape in boxed
+            run[index] = first[..., :0] if listed else first[..., :0, :]
+    return runs
 
 
 def _is_finite(output: npt.NDArray[Any]) -> bool:

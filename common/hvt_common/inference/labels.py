@@ -28,6 +28,7 @@ KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": V
 _NO_COCO_ID = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
 _FIRST_COCO_ID = {"tf-lists": 1, "labels-boxes-scores": 0, "ssd": 0}
 """Of heads that list objects by COCO's own ids, as TensorFlow, torchvision and the Open Model Zoo do."""
+_BACKGROUND = ("background", "???", "n/a")
 _FIRST_COCO_ID_OF = {90: 1, 91: 0}
 """By the number of classes."""
 _UNNAMED = 100
@@ -40,6 +41,8 @@ _NAME = re.compile(r"[\w .&'/+-]*[^\W\d_][\w .&'/+-]*")
 """Between commas or line ends, without brackets around."""
 _NUMBERED = re.compile(r"(\d+)\s*[:=,;.)\s]\s*(\S.*)")
 _SYNSET = re.compile(r"n\d{8}\s+")
+_PLAIN_LIST = re.compile(r"\[([^][{}'\":]*[^\W\d][^][{}'\":]*)\]")
+"""YAML's, without quotes."""
 _OF_TABLE = re.compile(r"[\[\]{}]|:$|^names\s*:")
 
 
@@ -78,7 +81,9 @@ def read_labels(path: Path) -> tuple[str, ...]:
 
 
 def _without_numbers(names: Sequence[str]) -> tuple[str, ...]:
-    # ``0 car``, ``1: bus`` or ``n02084071 dog``; what stands before all names is none of theirs.
+    # ``0 car``, ``1: bus``, ``- car`` or ``n02084071 dog``; what stands before all names is none of theirs.
+    if all(name.startswith("- ") for name in names):
+        return tuple(name[2:].strip(" '\"") or name for name in names)
     if all(map(_SYNSET.match, names)):
         return tuple(_SYNSET.sub("", name) for name in names)
     found = [_NUMBERED.fullmatch(name) for name in names]
@@ -113,9 +118,16 @@ def detector_labels(
         by_head = _FIRST_COCO_ID.get(head) if inputs == 1 else None
         first = by_head if classes is None else _FIRST_COCO_ID_OF.get(classes)
         names = names if first is None else _coco_names_by_id()[first:]
+    if head == "tf-lists" and names[0].strip("_").casefold() in _BACKGROUND:
+        names = names[1:]  # it counts from 1
     if classes is not None and len(names) != classes:
         raise UserError(f"{said_by} has {len(names)} class names; {path} has {classes} classes")
     return names
+
+
+def counts_from_one(head: str) -> bool:
+    """Whether networks of this head may list no class 0, the background, whose name their names then lack."""
+    return head in _FIRST_COCO_ID
 
 
 def _coco_names_by_id() -> tuple[str, ...]:
@@ -170,8 +182,9 @@ def _written_names(text: str) -> tuple[str, ...] | None:
     text = text.strip()
     if not text or len(text) > _MAX_METADATA_CHARS:
         return None
-    if text[0] not in "[{(":
-        names = [name.strip() for name in re.split(r"[,\n]", text) if name.strip()]
+    plain = _PLAIN_LIST.fullmatch(text)
+    if plain or text[0] not in "[{(":
+        names = [name.strip() for name in re.split(r"[,\n]", plain[1] if plain else text) if name.strip()]
         names = list(_without_numbers(names))
         return _names(names) if all(map(_NAME.fullmatch, names)) else None
     for read in (ast.literal_eval, json.loads, _unquoted):

@@ -106,6 +106,8 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
         ({"names": '{"nc": 2}'}, None),
         ({"names": "[{'id': 0, 'name': 'car'}]"}, None),
         ({"names": "0: car\n1: bus"}, ("car", "bus")),
+        ({"names": "- car\n- 'bus'"}, ("car", "bus")),
+        ({"names": "[small car, bus]"}, ("small car", "bus")),
         ({"names": r"{0: 'a\ud800', 1: 'b\nc', 2: ''}"}, ("a?", "b?c", "class 2")),
     ],
 )

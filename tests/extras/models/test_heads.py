@@ -14,7 +14,8 @@ from onnx import TensorProto, helper
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.heads.choose import HEAD_NAMES
-from hvt_common.inference.runtimes.model import open_model
+from hvt_common.inference.runtimes.model import OnnxModel, Port, open_model
+from hvt_common.inference.runtimes.providers import ProviderChoice
 from media.head_models import FAMILIES, NEEDS_NAMES, SQUARES, Graph, family_model, picture
 from media.onnx_models import constant_model, save, scaling_inside
 
@@ -146,6 +147,63 @@ def test_a_softmax_over_no_object_is_no_sigmoid(tmp_path: Path) -> None:
     logits[..., 4] = 8
     with pytest.raises(UserError, match="--head"):
         open_detector(str(constant_model(tmp_path / "m.onnx", logits, boxes)))
+
+
+@pytest.mark.parametrize(
+    ("scores", "form"),
+    [([0.02, 0.03, 0.95], "centre"), ([0.9, 0.05, 0.05], "centre"), ([-4.0, -3.0, -5.0], "corners")],
+)
+def test_what_is_not_detrs_form_is_not_taken_for_it(tmp_path: Path, scores: list[float], form: str) -> None:
+    """Each query of a softmax would be an object of the class "none"; corners would be boxes elsewhere."""
+    boxes = np.tile([0.5, 0.5, 0.2, 0.2] if form == "centre" else [0.1, 0.1, 0.4, 0.4], (1, 100, 1))
+    path = constant_model(tmp_path / "m.onnx", np.tile(scores, (1, 100, 1)), boxes)
+    with pytest.raises(UserError, match="--head"):
+        open_detector(str(path))
+
+
+class Answers:
+    """A network that answers one picture after the other with these outputs, and then with the last."""
+
+    def __init__(self, *answers: np.ndarray) -> None:
+        self.left = list(answers)
+
+    def run(self, *_feeds: np.ndarray) -> list[np.ndarray]:
+        return [self.left.pop(0) if self.left[1:] else self.left[0]]
+
+
+def answering(*answers: np.ndarray) -> tuple[OnnxDetector, Answers]:
+    """A detector of such a network; it is tried with three pictures."""
+    ports = (Port("images", (1, 3, 192, 320), np.dtype(np.float32)),), (Port("o", (), np.dtype(np.float32)),)
+    network = Answers(*answers)
+    choice = ProviderChoice("cpu", "", explicit=True)
+    model = OnnxModel(Path("m.onnx"), *ports, metadata=NAMED, runner=network, provider=choice)
+    return OnnxDetector(model), network
+
+
+ROWS = np.array([[[64, 32, 160, 96, 0.9, 0], [192, 96, 288, 160, 0.8, 1]]], np.float32)
+
+
+@pytest.mark.parametrize("empty", [(0,), (1, 0), (0, 6), (1, 0, 0), (1, 0, 6)])
+def test_no_objects_are_an_empty_answer_of_any_form(empty: tuple[int, ...]) -> None:
+    """The program ended in a traceback, or a flight went on without detections, over an empty picture."""
+    nothing = np.empty(empty, np.float32)
+    detector, _ = answering(nothing, ROWS, nothing, ROWS, nothing)
+    check(detector, "end-to-end")
+
+
+def test_an_answer_that_cannot_be_is_refused_in_words() -> None:
+    """Boxes of nonsense; or a picture without objects, where the scores were a column that is none."""
+    for other in (ROWS[0], ROWS[..., :5].repeat(2, axis=1), ROWS.transpose(0, 2, 1), np.array(3)):
+        with pytest.raises(UserError, match="answers one picture with"):
+            answering(ROWS, other)
+        detector, _ = answering(ROWS, ROWS, ROWS, other)
+        with pytest.raises(
+            UserError, match=r"^model m\.onnx answers a picture with \(.*others with \(1, 2, 6\)$"
+        ):
+            detector.detect(picture())
+    detector, _ = answering(ROWS[:, :0], ROWS[:, :0], ROWS[:, :0], ROWS[..., [5, 4, 0, 1, 2, 3]])
+    with pytest.raises(UserError, match="confidences above 1: it is not end-to-end"):
+        detector.detect(picture())
 
 
 @pytest.mark.parametrize("transposed", [False, True])
@@ -285,6 +343,24 @@ def test_coco_names_are_those_of_the_numbers_that_a_network_lists(
     by_id = family in ("tensorflow", "ssd")
     assert (len(names), names[-1]) == (83 + truck if by_id else 80, "toothbrush")
     assert (names[truck + 4] == "class 12") == by_id
+
+
+@pytest.mark.parametrize("family", ["ssd", "d-fine, deployed"])
+def test_names_that_lack_the_background_name_nothing(tmp_path: Path, family: str) -> None:
+    """Of torchvision's lists, which begin at 1, each object had the name of the next class."""
+    path = family_model(tmp_path / "m.onnx", family, metadata={"names": "['red']"})
+    with pytest.raises(
+        UserError, match=r"lists class 1, and has names of class 0 to class 0: .*a background too"
+    ):
+        opened(path).detect(picture())
+
+
+def test_a_background_among_the_names_of_tensorflow_shifts_none(tmp_path: Path) -> None:
+    """Its classes begin at 1, and were called by the name before: the first one "background"."""
+    names = {"names": "['__background__', 'red', 'blue']"}
+    detector = opened(family_model(tmp_path / "m.onnx", "tensorflow", metadata=names))
+    assert detector.class_names == ("red", "blue")
+    check(detector, "tf-lists")
 
 
 def test_a_class_beyond_the_names_is_said_once(tmp_path: Path, caplog) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -57,8 +58,10 @@ class Trial:
 
     def table(self, index: int) -> Array:
         """(N, K) rows of an output of all pictures: its last axis, whatever stands before it."""
+        columns = self.shape(index)[-1]
+        answers = [run[index] for run in self.runs if run[index].shape[-1] == columns]
         return np.concatenate(
-            [run[index].astype(np.float32).reshape(-1, run[index].shape[-1]) for run in self.runs]
+            [one.astype(np.float32).reshape(math.prod(one.shape[:-1]), columns) for one in answers]
         )
 
     def numbers(self, index: int) -> Array:
@@ -178,7 +181,7 @@ class Kind:
         """Whether the outputs have its shape, judged by the pictures in the range of its pixels."""
         return self.match(trial.up_to(255 if self.preparation.scale[0] == 1 else 1))
 
-    def head(self, name: str, match: Match, why: str) -> Head:
+    def head(self, name: str, match: Match, why: str, trial: Trial) -> Head:
         return Head(
             name,
             match.classes,
@@ -188,6 +191,7 @@ class Kind:
             self.suppresses,
             match.decoder,
             why,
+            tuple(map(trial.shape, match.outputs)),
         )
 
 
@@ -293,7 +297,7 @@ def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
         certain = found
     if len(certain) == 1:
         ((name, match),) = certain.items()
-        return kinds[name].head(name, match, why + (match.proof or "its shape fits"))
+        return kinds[name].head(name, match, why + (match.proof or "its shape fits"), trial)
     if not found:
         more = "" if library is not None else f"; of other heads, {MISSING}"
         raise UserError(f"its outputs fit no head that is known{more}")
@@ -309,7 +313,7 @@ def _named(trial: Trial, name: str, by: str) -> Head:
     match = kind.fits(trial)
     if match is None:
         raise UserError(f"its outputs are not those of {by} {name}, which is {kind.text}")
-    return kind.head(name, match, f"{by} {name}")
+    return kind.head(name, match, f"{by} {name}", trial)
 
 
 def _says_rt_detr(trial: Trial) -> bool:

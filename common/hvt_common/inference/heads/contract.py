@@ -13,6 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.errors import UserError
 from hvt_common.inference.letterbox import Anchor, Preparation
 from hvt_common.values import Boxes
 
@@ -30,6 +31,8 @@ class HeadOutput:
     class_ids: npt.NDArray[np.int32]
     second: npt.NDArray[np.bool_] | None = None
     """(N,) which are of the second one of two networks in one file; None where there is one."""
+    beyond: bool = False
+    """Some were left out whose score is above 1: what is no probability is no score."""
 
 
 class Decoder(Protocol):
@@ -58,13 +61,28 @@ class Head:
     decoder: Decoder
     why: str
     """The evidence for it, half a sentence."""
+    shapes: tuple[tuple[int, ...], ...]
+    """Of ``outputs``, as they were tried; from picture to picture one axis may change, or nothing is left."""
 
     def decode(
         self, outputs: Sequence[npt.NDArray[Any]], *, confidence: float, input_size: tuple[int, int]
     ) -> HeadOutput:
-        """Decode all outputs of one run into boxes of at least this confidence."""
+        """Decode all outputs of one run into boxes of at least this confidence.
+
+        Raises `UserError`, half a sentence, where they have another form than when they were tried.
+        """
         used = [outputs[index].astype(np.float32, copy=False) for index in self.outputs]
+        if not all(one.size for one in used):
+            return valid(np.empty((0, 4), np.float32), np.empty(0, np.float32), np.empty(0), confidence)
+        for one, usual in zip(used, self.shapes, strict=True):
+            if not is_like(one.shape, usual):
+                raise UserError(f"answers a picture with {one.shape}, and others with {usual}")
         return self.decoder(used, confidence=confidence, input_size=input_size)
+
+
+def is_like(shape: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Whether they differ in one axis at most: in the number of cells, or of objects."""
+    return len(shape) == len(other) and sum(a != b for a, b in zip(shape, other, strict=True)) <= 1
 
 
 MOST_RELATIVE = 1.5
@@ -75,6 +93,7 @@ Form = Literal["centre", "corners", "corners-yx"]
 
 _MAX_LOG_SIZE = 20.0  # e^20 strides: far outside every image, and still finite in float32
 _MOST_CLASSES = 1e6
+_MOST_SCORE = 1.01  # half precision rounds
 
 
 class YoloxCells:
@@ -151,12 +170,14 @@ def valid(
     second: npt.NDArray[np.bool_] | None = None,
 ) -> HeadOutput:
     """Without boxes that are not finite, have no area or too little confidence; a broken number is no detection."""
-    valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= 1.01)
+    valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= _MOST_SCORE)
     valid &= np.isfinite(class_ids) & (class_ids >= 0) & (class_ids < _MOST_CLASSES)
     valid &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+    beyond = bool((scores > _MOST_SCORE).any())
     return HeadOutput(
         boxes[valid].astype(np.float32, copy=False),
         np.minimum(scores[valid], np.float32(1)),
         np.rint(class_ids[valid]).astype(np.int32),
         None if second is None else second[valid],
+        beyond,
     )
