@@ -1,10 +1,15 @@
-"""Files that people name, read whole within a bound. A device that never ends is one that is too large."""
+"""Files that people name: read whole within a bound, written whole or not at all.
+
+A device that never ends is one that is too large to read.
+"""
 
 from __future__ import annotations
 
 import codecs
 import errno
 import os
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 MOST_BYTES = 16_000_000
@@ -34,3 +39,35 @@ def decoded(content: bytes) -> str:
     """Text in UTF-8, or as its byte order mark says. Raises `UnicodeDecodeError` for anything else."""
     wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return content.decode("utf-16" if wide else "utf-8-sig")
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, through a link to where it leads; another process may do so, too.
+
+    A pipe or a device takes the bytes as they come, and so does standard output: what was printed stays before them.
+    Raises `OSError`.
+    """
+    if _is_output(path):
+        sys.stdout.flush()
+        with open(1, "wb", closefd=False) as output:
+            output.write(content)
+        return
+    if path.exists() and not path.is_file():
+        path.write_bytes(content)
+        return
+    real = Path(os.path.realpath(path))
+    scratch = real.with_name(f"{real.name}.{os.getpid()}.part")
+    try:
+        scratch.write_bytes(content)
+        scratch.replace(real)
+    except OSError:
+        with suppress(OSError):
+            scratch.unlink()
+        raise
+
+
+def _is_output(path: Path) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(1))
+    except OSError:  # not there yet
+        return False

@@ -21,6 +21,7 @@ import onnx
 from onnx import compose, helper, numpy_helper, parser, version_converter
 
 from hvt_common.errors import UserError
+from hvt_common.files import write_whole
 from hvt_common.inference.class_names import COCO_NAMES
 from hvt_common.inference.labels import metadata_labels
 from hvt_train.learning.halve import halve, stripe_stem, unfold_stem
@@ -160,9 +161,7 @@ def join(aerial: Path, street: Path, out: Path) -> None:
     helper.set_model_props(model, properties)
     model.producer_name = "hvt_train"
     onnx.checker.check_model(model)
-    partial = out.with_suffix(".part")
-    partial.write_bytes(model.SerializeToString())
-    partial.replace(out)
+    write_whole(out, model.SerializeToString())
 
 
 def _aerial_part(model: onnx.ModelProto) -> onnx.ModelProto:

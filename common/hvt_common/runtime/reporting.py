@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read
+from hvt_common.files import write_whole
 from hvt_common.runtime.log import STATUS_LOGGER
 from hvt_common.units import shown_text
 
@@ -150,17 +151,8 @@ def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) 
 
 
 def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
-    """Write the summary; into a file whole or not at all. Raises `FlightError` where it cannot be written."""
-    text = json.dumps(content, indent=2) + "\n"
-    # /dev/stdout or a pipe is to be written to, not to be replaced.
-    replaces = path.is_file() or not path.exists()
-    scratch = path.with_name(path.name + ".part") if replaces else path
+    """Write the summary, as `write_whole`. Raises `FlightError` where it cannot be written."""
     try:
-        scratch.write_text(text, encoding="utf-8")
-        if replaces:
-            scratch.replace(path)
+        write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
     except OSError as error:
-        if replaces:
-            with contextlib.suppress(OSError):
-                scratch.unlink(missing_ok=True)
         raise FlightError(f"{path} cannot be written ({error.strerror})") from error

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.labels import default_confidence
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import tiled
+from hvt_common.runtime.reporting import write_json
 from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
@@ -182,7 +182,7 @@ def _detect(arguments: argparse.Namespace) -> int:
             "skipped": len(pictures) - seen,
             **picture_score(used, detection_score(every), recall_only=recall_only),
         }
-        (arguments.out / "score.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+        write_json(arguments.out / "score.json", about)
         _write_sheets(arguments.out, paths, used, classes=classes, recall_only=recall_only)
         print_score(about)
         if not recall_only:

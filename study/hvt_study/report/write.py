@@ -18,6 +18,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from markupsafe import Markup
 
 from hvt_common.errors import UserError, check_not_read
+from hvt_common.files import write_whole
 from hvt_study.metrics.bits import Accounting, in_accounting
 from hvt_study.report.data.arms import settings
 from hvt_study.report.data.document import Drawing, Pictures, Report, numbered
@@ -107,9 +108,9 @@ def write_report(folder: Path, *, accounting: Accounting | None = None) -> None:
         figures = dict(_figure_files(report))
         (folder / FIGURES).mkdir(exist_ok=True)
         for name, content in figures.items():
-            _put(folder / FIGURES / name, content)
-        _put(folder / "report.md", markdown_page(report).encode())
-        _put(folder / "report.html", html_page(report).encode())
+            write_whole(folder / FIGURES / name, content)
+        write_whole(folder / "report.md", markdown_page(report).encode())
+        write_whole(folder / "report.html", html_page(report).encode())
         _remove_others(folder / FIGURES, figures.keys())
     except OSError as error:
         raise UserError(f"{folder} cannot be written ({error.strerror}): name a folder that can") from None
@@ -123,12 +124,6 @@ def _figure_files(report: Report) -> Iterator[tuple[str, bytes]]:
         elif isinstance(part, Pictures):
             for picture in (one for row in part.rows for one in row.pictures):
                 yield f"{picture.name}.png", picture.png
-
-
-def _put(path: Path, content: bytes) -> None:
-    scratch = path.with_name(path.name + ".part")
-    scratch.write_bytes(content)
-    scratch.replace(path)
 
 
 def _on_white(svg: str) -> str:

@@ -14,6 +14,7 @@ import torch
 from onnx import helper, numpy_helper
 from torch import Tensor, nn
 
+from hvt_common.files import write_whole
 from hvt_train.learning.detector import Added, DetectorNet
 from hvt_train.learning.halve import halve, unfolded
 
@@ -155,6 +156,4 @@ def export_onnx(
     helper.set_model_props(model, dict(properties))
     model.producer_name, model.producer_version = "hvt_train", ""
     onnx.checker.check_model(model)
-    partial = path.with_suffix(".part")
-    partial.write_bytes(model.SerializeToString())
-    partial.replace(path)
+    write_whole(path, model.SerializeToString())

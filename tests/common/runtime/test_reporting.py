@@ -38,6 +38,31 @@ def test_a_summary_can_go_into_a_pipe(tmp_path):
     assert pipe.is_fifo()
 
 
+def test_a_summary_goes_through_a_link(tmp_path):
+    """The link, of a disk with room, was replaced by a file, and what it leads to stayed as it was."""
+    (tmp_path / "disk").mkdir()
+    link, file = tmp_path / "summary.json", tmp_path / "disk" / "summary.json"
+    link.symlink_to(file)
+    for frames in (1, 2):
+        write_json(link, {"frames": frames})
+        assert link.is_symlink()
+        assert json.loads(file.read_text()) == {"frames": frames}
+
+
+def test_a_summary_on_standard_output_stands_behind_what_was_printed(tmp_path):
+    """``--summary /dev/stdout > run.txt``, of root, replaced the system's /dev/stdout by a file."""
+    link = tmp_path / "stdout"
+    link.symlink_to("/dev/fd/1")
+    program = (
+        "import sys; from pathlib import Path; from hvt_common.runtime.reporting import write_json;"
+        "print('table'); write_json(Path(sys.argv[1]), {}); print('end')"
+    )
+    with (tmp_path / "run.txt").open("w") as output:
+        subprocess.run([sys.executable, "-c", program, str(link)], stdout=output, check=True)
+    assert (tmp_path / "run.txt").read_text() == "table\n{}\nend\n"
+    assert link.is_symlink()
+
+
 def test_files_that_cannot_be_written_are_refused_before_the_run(tmp_path):
     """The numbers of an hour's flight would be lost at its end."""
     check_writable(None, name="--summary")
@@ -107,7 +132,7 @@ def test_a_disk_without_room_leaves_no_half_of_a_summary(tmp_path, monkeypatch):
         path.touch()
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(FlightError, match="No space left on device"):
         write_json(tmp_path / "summary.json", {})
     assert not list(tmp_path.iterdir())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvt_common.errors import UserError
+from hvt_common.files import write_whole
 from hvt_study.runs.spec import COLUMNS, Column
 
 RESULTS = "results.parquet"
@@ -46,13 +47,11 @@ def write_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         {column.name: [_value(row.get(column.name), column) for row in rows] for column in COLUMNS},
         schema=SCHEMA,
     )
-    scratch = path.with_name(f"{path.name}.{os.getpid()}.part")
+    content = io.BytesIO()
+    pq.write_table(table, content, compression="zstd")
     try:
-        with scratch.open("wb") as file:  # not by its name: Arrow takes one in UTF-8 only
-            pq.write_table(table, file, compression="zstd")
-        scratch.replace(path)
+        write_whole(path, content.getvalue())
     except OSError as error:
-        scratch.unlink(missing_ok=True)
         raise UserError(f"{path} cannot be written ({_why(error)}): name a folder that can") from None
 
 
