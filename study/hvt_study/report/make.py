@@ -66,11 +66,11 @@ def _tally(found: Sequence[Pair]) -> str:
     few = len(found) - len(sure)
     if not sure:
         return (
-            f"That is no verdict: {_pairs(few, 'has', 'have')} fewer than {ENOUGH} sequences, of which an interval "
-            "says nothing."
+            f"That is no verdict: {_pairs(few, 'has', 'have')} fewer than {ENOUGH} independent sequences, of "
+            "which an interval says nothing."
         )
     ahead, behind = sum(one.low > 0 for one in sure), sum(one.high < 0 for one in sure)
-    left = f"; {few} more have fewer than {ENOUGH} sequences and are not counted" if few else ""
+    left = f"; {few} more have fewer than {ENOUGH} independent sequences and are not counted" if few else ""
     return (
         f"Of {_pairs(len(sure), '', '')} the interval lies above 0 in {ahead}, below in {behind}, and holds 0 in "
         f"{len(sure) - ahead - behind}{left}. No account is taken of how many were looked at."
@@ -133,8 +133,8 @@ def _lead(rows: Sequence[RunRow]) -> Iterator[str]:
         )
     yield (
         f"Means are over sequences, with 95 % percentile bootstrap intervals in brackets from {ENOUGH} sequences on: "
-        "sequences are drawn, not frames. Of fewer than some ten the interval is too narrow. A dash stands where "
-        "there is no figure."
+        "sequences are drawn, not frames, and those over one picture together. Of fewer than some ten the interval "
+        "is too narrow. A dash stands where there is no figure."
     )
 
 

@@ -123,7 +123,9 @@ def _has_any(runs: BySequence, column: str) -> bool:
 def _mean_cell(runs: BySequence, column: str, *, interval: bool) -> Cell:
     """The mean over those sequences that have the figure; where some lack it, that is said beneath."""
     own, metric = values(runs, column), METRICS[column]
-    take = median_of if metric.over == "median" else interval_of if interval else mean_of
+    if interval and metric.over != "median":
+        return figure_cell(interval_of(own), metric, of=len(own))
+    take = median_of if metric.over == "median" else mean_of
     return figure_cell(take(own.values()), metric, of=len(own))
 
 
@@ -148,7 +150,7 @@ def matrix_table(setting: Setting, column: str) -> Table | None:
         says = METHODS[method].says if method in METHODS else ""
         found = list(cells(method, codec or NOTHING, says))
         for one in ((regime, method, codec) for regime in setting.regimes):
-            interval = interval_of(figures[one])
+            interval = interval_of(figures[one].to_dict())
             found.append(figure_cell(interval, metric, of=setting.sequences, strong=one in best))
         rows.append(tuple(found))
     heads = words("method", "codec", "what it does")

@@ -181,7 +181,7 @@ def test_no_verdict_is_drawn_from_few_sequences():
     few = make_report([*many(4), *many(4, dataset="demo:0-3")])  # the same four under another name
     text = few.sections[0].parts[0]
     assert "+0.100 named F1 (n = 4)" in text
-    assert "That is no verdict: 1 pair of method and regime has fewer than 5 sequences" in text
+    assert "That is no verdict: 1 pair of method and regime has fewer than 5 independent sequences" in text
     enough = make_report(many(5))
     (text,) = [part for part in enough.sections[0].parts if isinstance(part, str)]
     assert "+0.100 [+0.100, +0.100] named F1 (n = 5)" in text
@@ -189,7 +189,9 @@ def test_no_verdict_is_drawn_from_few_sequences():
         "Of 1 pair of method and regime the interval lies above 0 in 1, below in 0, and holds 0 in 0." in text
     )
     both = make_report([*many(5), *(one | {"regime": "high", "key": f"h{one['key']}"} for one in many(2))])
-    assert "; 1 more have fewer than 5 sequences and are not counted." in both.sections[0].parts[0]
+    assert (
+        "; 1 more have fewer than 5 independent sequences and are not counted." in both.sections[0].parts[0]
+    )
 
 
 def test_brackets_and_bold_are_of_enough_sequences():
@@ -404,47 +406,66 @@ def test_figures_of_an_earlier_report_go_and_what_is_not_ours_stays(tmp_path):
 # Confidence intervals over sequences, against values worked out by hand and against what they promise.
 
 
+def _interval(values):
+    return interval_of({f"demo:0-99#demo-{seed}": value for seed, value in enumerate(values)})
+
+
 def test_an_interval_worked_out_by_hand():
     """A wrong interval would call noise a finding."""
     # The number of ones among five drawn from 0 0 0 0 1 is binomial (5, 0.2): its distribution function is
     # 0.328 at 0, 0.942 at 2 and 0.993 at 3, so that 95 % of the means lie from 0 to 3/5.
-    found = interval_of([0.0, 0.0, 1.0, 0.0, 0.0])
+    found = _interval([0.0, 0.0, 1.0, 0.0, 0.0])
     assert (found.mean, found.low, found.high, found.sequences) == (0.2, 0.0, pytest.approx(0.6), 5)
 
 
 def test_the_same_values_give_the_same_interval():
     """A report that changes from run to run proves nothing."""
     values = np.random.default_rng(3).exponential(size=24).tolist()
-    first = interval_of(values)
-    assert interval_of([*values, math.nan]) == first
+    first = _interval(values)
+    assert _interval([*values, math.nan]) == first
     assert first.low < first.mean < first.high
 
 
 def test_the_interval_holds_the_true_mean_about_as_often_as_it_says():
     """Sequences of a mean of 1: of 95 % intervals of thirty of them some 93 % hold it."""
     rng = np.random.default_rng(0)
-    intervals = [interval_of(rng.normal(1, 0.3, 30).tolist()) for _ in range(100)]
+    intervals = [_interval(rng.normal(1, 0.3, 30).tolist()) for _ in range(100)]
     assert 87 <= sum(one.low <= 1 <= one.high for one in intervals) <= 99
 
 
 def test_few_and_no_values():
     """Few sequences have a mean and no interval; equal ones an interval of no width; none nothing."""
-    few = interval_of([0.4, math.nan] * (ENOUGH - 1))
+    few = _interval([0.4, math.nan] * (ENOUGH - 1))
     assert (few.mean, few.sequences, math.isnan(few.low), math.isnan(few.high)) == (
         0.4,
         ENOUGH - 1,
         True,
         True,
     )
-    assert interval_of([]).sequences == 0
-    assert math.isnan(interval_of([math.nan]).mean)
-    equal = interval_of([0.3] * 5)
+    assert _interval([]).sequences == 0
+    assert math.isnan(_interval([math.nan]).mean)
+    equal = _interval([0.3] * 5)
     assert (equal.low, equal.high) == (pytest.approx(0.3), pytest.approx(0.3))
+
+
+def test_seeds_over_one_picture_are_no_sequences_of_their_own():
+    """Ten flights over two pictures had an interval as of ten pictures, and made a verdict."""
+    dataset, figures = "still:air?seeds=0-9&view=0.6", [0.1, 0.4, 0.2, 0.8, 0.3]
+
+    def found(pictures, seeds):
+        return interval_of(
+            {f"{dataset}#{p}-{seed}": figures[p] for p in range(pictures) for seed in range(seeds)}
+        )
+
+    assert math.isnan(found(4, 10).low)
+    assert found(4, 10).sequences == 40
+    once, often = _interval(figures), found(5, 3)
+    assert (often.low, often.high) == (pytest.approx(once.low), pytest.approx(once.high))
 
 
 def test_a_wait_without_end():
     """An infinite wait makes an infinite mean, and no interval."""
-    endless = interval_of([1.0, math.inf, 2.0, 3.0, 4.0])
+    endless = _interval([1.0, math.inf, 2.0, 3.0, 4.0])
     assert endless.mean == math.inf
     assert math.isnan(endless.low)
     assert math.isnan(mean_of([math.inf, -math.inf]).mean)

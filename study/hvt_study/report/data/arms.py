@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, TypeAlias
+from urllib.parse import parse_qsl
 
 from hvt_common.errors import UserError
 from hvt_study.runs.methods import METHODS, Kind
@@ -288,6 +289,16 @@ def place(dataset: str) -> str:
 def sequence_of(row: RunRow) -> str:
     """Dataset and name."""
     return f"{row['dataset']}#{row['sequence']}"
+
+
+def picture_of(name: str) -> str:
+    """What a sequence, by its `sequence_of`, is flown over: several seeds of ``still:`` have one picture."""
+    dataset, _, sequence = name.rpartition("#")
+    place, _, options = dataset.rpartition("?")
+    seeds = dict(parse_qsl(options)).get("seeds", "0")
+    if not dataset.startswith("still:") or not place:
+        return name
+    return f"{place}#{sequence if seeds == '0' else sequence.rpartition('-')[0]}"
 
 
 def clip_of(row: RunRow) -> str:

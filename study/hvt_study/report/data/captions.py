@@ -1,8 +1,9 @@
 """How tables say a figure: means, bootstrap intervals and medians over sequences, names, digits, captions.
 
 The interval is SciPy's percentile bootstrap (Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, chapter
-13). A sequence is what is drawn: frames of one sequence are not independent of each other. Differences are drawn as
-pairs (`hvt_study.report.data.pairs`): what makes a sequence hard for both sides cancels.
+13). A sequence is what is drawn, with all others over the same picture (`picture_of`): frames of one sequence are not
+independent of each other, nor are seeds of one picture. Differences are drawn as pairs
+(`hvt_study.report.data.pairs`): what makes a sequence hard for both sides cancels.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from scipy.stats import bootstrap
 
 from hvt_study.metrics.bits import Accounting
-from hvt_study.report.data.arms import Setting, place
+from hvt_study.report.data.arms import Setting, picture_of, place
 from hvt_study.report.data.document import Cell
 from hvt_study.runs.spec import COLUMNS, Column
 
@@ -41,9 +42,16 @@ class Interval:
     sequences: int
 
 
-def interval_of(values: Iterable[float]) -> Interval:
-    """The mean of what is not NaN, with its 95 % bootstrap interval; that is NaN with fewer than `ENOUGH` values."""
-    return _interval(tuple(value for value in values if not math.isnan(value)))
+def interval_of(values: Mapping[str, float]) -> Interval:
+    """The mean of what is not NaN, by sequence, with its 95 % bootstrap interval.
+
+    The interval is NaN with fewer than `ENOUGH` sequences, of which those over one picture are one.
+    """
+    known = {name: value for name, value in values.items() if not math.isnan(value)}
+    pictures: dict[str, list[float]] = {}
+    for name, value in known.items():
+        pictures.setdefault(picture_of(name), []).append(value)
+    return _interval(tuple(known.values()), tuple(map(tuple, pictures.values())))
 
 
 def mean_of(values: Iterable[float]) -> Interval:
@@ -62,17 +70,25 @@ def median_of(values: Iterable[float]) -> Interval:
 
 
 @lru_cache(maxsize=10_000)
-def _interval(values: tuple[float, ...]) -> Interval:
+def _interval(values: tuple[float, ...], pictures: tuple[tuple[float, ...], ...]) -> Interval:
     """Table, figure and summary need the same; the same values give the same interval."""
     mean = mean_of(values)
-    if len(values) < ENOUGH or not math.isfinite(mean.mean):
+    if len(pictures) < ENOUGH or not math.isfinite(mean.mean):
         return mean
-    drawn = bootstrap((values,), np.mean, n_resamples=_RESAMPLES, batch=_BATCH, method="percentile", rng=0)
+    drawn = bootstrap(
+        ([sum(one) for one in pictures], [len(one) for one in pictures]),
+        lambda sums, counts, axis: sums.sum(axis=axis) / counts.sum(axis=axis),
+        paired=True,
+        n_resamples=_RESAMPLES,
+        batch=_BATCH,
+        method="percentile",
+        rng=0,
+    )
     found = drawn.confidence_interval
     return replace(mean, low=float(found.low), high=float(found.high))
 
 
-INTERVALS = f"95 % bootstrap interval over sequences (from {ENOUGH} on)"
+INTERVALS = f"95 % bootstrap interval over sequences, those of one picture as one (from {ENOUGH} on)"
 _LABELS = {
     "annotations": "annotations (people's, or exact)",
     "reference": "reference (the detector on source frames before they are coded, in tiles, "

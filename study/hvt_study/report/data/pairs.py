@@ -41,7 +41,7 @@ class Pair:
 
     def interval(self, column: str) -> Interval:
         """Of the mean gap over the sequences of both; none of few sequences."""
-        return interval_of(self.gaps(column).values())
+        return interval_of(self.gaps(column))
 
     def most_off_pct(self) -> float:
         """The largest distance of two totals, in per cent of the arm's; 0 without pairs."""

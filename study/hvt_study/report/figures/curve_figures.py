@@ -152,7 +152,7 @@ def _draw_codecs(
     places: list[tuple[float, float]] = []
     for codec in codecs:
         arm = Arm(regime, method, codec)
-        sizes, interval = _sizes(setting, arm), interval_of(values(setting.runs(arm), column).values())
+        sizes, interval = _sizes(setting, arm), interval_of(values(setting.runs(arm), column))
         if not sizes or math.isnan(interval.mean):
             continue
         places.append((float(np.mean(sizes)), interval.mean))
