@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Final
 
 from hvt_common.errors import Parser, exit_with_sentence, needs_extra
+from hvt_common.runtime.process import interrupt_on_signals
 
 COMMANDS: Final = {
     "plan": "Say how many runs, bytes and hours `hvt-study run` with the same arguments would take.",
@@ -40,6 +41,7 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``hvt-study``; 0, or 2 after one sentence on stderr where the user can mend something."""
+    interrupt_on_signals()
     return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
 
 

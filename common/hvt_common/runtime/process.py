@@ -58,6 +58,13 @@ def stop_on_signals() -> threading.Event:
     return stop
 
 
+def interrupt_on_signals() -> None:
+    """Have SIGTERM and SIGHUP end what runs as Ctrl-C does: it says so, and leaves nothing half done behind."""
+    for one in STOP_SIGNALS:
+        if signal.getsignal(one) is signal.SIG_DFL:  # ``nohup`` has SIGHUP ignored
+            signal.signal(one, signal.default_int_handler)
+
+
 def notify_systemd(state: str) -> None:
     """Send ``READY=1`` or ``WATCHDOG=1`` to systemd, where it started this process with ``Type=notify``.
 

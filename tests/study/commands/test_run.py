@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 
 import numpy as np
 import pytest
@@ -136,7 +137,8 @@ def test_a_second_run_does_nothing_anew(scene, done):
     assert (done / "results.parquet").read_bytes() == clocks  # to the byte: what was timed is remembered too
 
 
-def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkeypatch):
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkeypatch, how):
     """Started again and stopped after a minute, a study of a thousand rows would be a study of three."""
     out = tmp_path / "out"
     out.mkdir()
@@ -145,11 +147,15 @@ def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkey
 
     def interrupted(*_, on_row, **__):
         on_row(before[0], 1, len(before))
-        raise KeyboardInterrupt
+        signal.raise_signal(how)
 
     monkeypatch.setattr(command, "run_all", interrupted)
     words = arguments(scene, out, "--methods", "M0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
-    assert main(["run", *words]) == 130
+    kept = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        assert main(["run", *words]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, kept)
     assert {row["key"] for row in table(out)} == {row["key"] for row in before}
     assert len(table(out)) == len(before)
 
