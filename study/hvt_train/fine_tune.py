@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from hvt_common.errors import UserError
+from hvt_common.files import write_whole
 from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import open_detector
 from hvt_train.learning.calibration import NONE, Calibration, fit_calibration
@@ -107,7 +108,10 @@ def fine_tune(
     torch.set_num_threads(settings.threads)
     known = open_detector(str(start)).class_names
     _check(start, len(known))
-    best = _Best(classes, start=start, out=out, settings=settings, measure=measure, on_step=on_step)
+    trial = pool[0].with_name("trial.onnx")
+    best = _Best(
+        classes, start=start, out=out, trial=trial, settings=settings, measure=measure, on_step=on_step
+    )
     loop = LoopSettings(
         steps=settings.steps,
         rate=settings.rate,
@@ -157,11 +161,12 @@ class _Best:
         *,
         start: Path,
         out: Path,
+        trial: Path,
         settings: FineTuneSettings,
         measure: Callable[[Path], float],
         on_step: Callable[[int, float | None], None],
     ) -> None:
-        self._classes, self._out, self._settings = classes, out, settings
+        self._classes, self._out, self._trial, self._settings = classes, out, trial, settings
         self._measure, self._on_step = measure, on_step
         self._quality, self._in_vain = -1.0, 0
         self._net: nn.Module | None = None
@@ -183,16 +188,14 @@ class _Best:
         if step % settings.check_every and step != settings.steps and not late:
             self._on_step(step, None)
             return {}
-        trial = self._out.with_suffix(".trial.onnx")
-        self._export(copy.deepcopy(net), trial, NONE)
-        quality = self._measure(trial)
+        self._export(copy.deepcopy(net), self._trial, NONE)
+        quality = self._measure(self._trial)
         self._on_step(step, quality)
         self._in_vain += 1
         if quality > self._quality:
             self._quality, self._in_vain, self.best_step = quality, 0, step
             self._net = copy.deepcopy(net)
-            trial.replace(self._out)
-        trial.unlink(missing_ok=True)
+            write_whole(self._out, self._trial.read_bytes())
         if self._in_vain >= settings.patience or late:
             raise _EnoughError
         return {"validation": round(quality, 4)}

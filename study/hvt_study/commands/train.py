@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import shutil
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.store import EMBEDDED_DETECTOR, resolve_model
-from hvt_common.runtime.reporting import check_writable
+from hvt_common.runtime.reporting import check_writable, write_json
 from hvt_common.units import parse_size
 from hvt_common.values import Boxes, Image, View
 from hvt_edge.source.resample import Resizer
@@ -115,9 +114,9 @@ def run(arguments: argparse.Namespace) -> int:
             yield HeldOut(image, there.boxes_xyxy_px, there.ignored_xyxy_px, frozenset(classes))
 
     before = _scored(start, held_out, size, classes, confidence=_confidence(start))
-    pool = out.with_suffix(".pool")
-    try:
-        files = fill_own(pool, pictures(), seed=arguments.seed)
+    # Beside FILE.onnx, for there is room; with a name that nobody has.
+    with tempfile.TemporaryDirectory(prefix=f"{out.stem}-", dir=out.parent) as pool:
+        files = fill_own(Path(pool), pictures(), seed=arguments.seed)
         with RunProgress("steps") as progress:
 
             def step(done: int, quality: float | None) -> None:
@@ -140,8 +139,6 @@ def run(arguments: argparse.Namespace) -> int:
                 measure=lambda path: _ap50(path, held_out, size, classes),
                 on_step=step,
             )
-    finally:
-        shutil.rmtree(pool, ignore_errors=True)
     after = _scored(out, held_out, size, classes, confidence=_confidence(out))
     about = {
         "classes": classes,
@@ -152,7 +149,7 @@ def run(arguments: argparse.Namespace) -> int:
         "before": before,
         "after": after,
     }
-    out.with_suffix(".json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    write_json(out.with_suffix(".json"), about)
     _print(about)
     if tuned.calibration is None:
         print("too few boxes on held-out pictures, or none wrong, to calibrate: scores are no probabilities")
