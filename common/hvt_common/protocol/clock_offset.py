@@ -80,18 +80,22 @@ class ClockOffset:
 class CaptureClock:
     """The times of one camera by this ground's clock.
 
-    A camera's clock may be years off, and an edge may say what it likes. A picture that came before it was captured,
-    or a minute after, counts from its arrival, and so do those after it, as long as that can be.
+    A camera's clock may be years off, and an edge may say what it likes. A picture that came long before it was
+    captured, or a minute after, counts from its arrival, and so do those after it, as long as that can be. One that
+    came a little before shows by how much, at least, an exchange in a queue is wrong.
     """
 
     def __init__(self, edge_clock: ClockOffset) -> None:
         self._edge_clock = edge_clock
         self._own_offset_ns: int | None = None
+        self._least_offset_ns = -(2**63)
+        """The camera's clock minus ours, if the quickest picture came at once."""
 
     def note(self, capture_ns: int, *, received_ns: int) -> None:
         """Take the time of something that has just come."""
         if -_EARLY_NS <= received_ns - self._edge_clock.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
             self._own_offset_ns = None
+            self._least_offset_ns = max(self._least_offset_ns, capture_ns - received_ns)
         elif self.is_sound or not 0 <= received_ns - self.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
             self._own_offset_ns = capture_ns - received_ns
 
@@ -103,7 +107,10 @@ class CaptureClock:
     @property
     def offset_ns(self) -> int:
         """The camera's clock minus ours."""
-        return self._edge_clock.offset_ns if self._own_offset_ns is None else self._own_offset_ns
+        if self._own_offset_ns is not None:
+            return self._own_offset_ns
+        offset_ns, error_ns = self._edge_clock.estimate or (0, 0)
+        return min(max(offset_ns, self._least_offset_ns), offset_ns + error_ns)
 
     def to_local_ns(self, capture_ns: int) -> int:
         """A time of the camera as our clock would have shown it."""

@@ -9,7 +9,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.protocol.clock_offset import CaptureClock, ClockOffset
 from hvt_common.runtime.clock import SteadyClock
 
 MS = 1_000_000
@@ -71,6 +71,21 @@ def test_contradictory_times_are_left_out():
     assert not clock.add(t0_ns=10, t1_ns=0, t2_ns=100, t3_ns=20)
     assert not clock.add(t0_ns=0, t1_ns=50, t2_ns=40, t3_ns=90)
     assert clock.estimate is None
+
+
+def test_no_picture_comes_before_it_was_captured():
+    """Where the first answer waited in a queue, a delay of 0 ms would be shown for a minute."""
+    clock = ClockOffset()
+    camera = CaptureClock(clock)
+    exchange(clock, at_ns=0, offset_ns=0, out_ns=10 * MS, held_ns=0, back_ns=2_010 * MS)
+    for captured_ms, took_ms, shown_ms in ((3_000, 60, 0), (3_100, 20, 0), (3_200, 60, 40)):
+        camera.note(captured_ms * MS, received_ns=(captured_ms + took_ms) * MS)
+        assert (captured_ms + took_ms) * MS - camera.to_local_ns(captured_ms * MS) == shown_ms * MS
+    camera.note(9_000 * MS, received_ns=5_000 * MS)  # a camera that is ahead
+    assert camera.is_sound
+    assert camera.offset_ns == 10 * MS  # at most what the exchange leaves open
+    exchange(clock, at_ns=9_000 * MS, offset_ns=0, out_ns=MS, held_ns=0, back_ns=MS)
+    assert camera.offset_ns == MS
 
 
 def test_two_threads_may_use_it():
