@@ -26,7 +26,9 @@ _STEP_S = 3.0
 """Longest wait for a connection, and again for each answer."""
 _ALERT_S = 1.0
 """A refusal of our certificate comes after the handshake is over for us (TLS 1.3, RFC 8446 section 4.4.2.4)."""
-_TCP = re.compile(r"(?P<protocol>tcp|tls|ws)/(?P<host>\[[^\]]+\]|[^:/]+):(?P<port>\d{1,5})([?#].*)?")
+_ENDPOINT = re.compile(
+    r"(?P<protocol>tcp|tls|ws|udp|quic)/(?P<host>\[[^\]]+\]|[^:/]+):(?P<port>\d{1,5})([?#].*)?"
+)
 
 # Verification errors of OpenSSL, x509_vfy.h.
 _OTHER_CA = {2, 7, 18, 19, 20, 21}
@@ -57,12 +59,18 @@ def why_no_link(endpoint: str, files: TlsFiles) -> str:
 
     A name is looked up by the system's resolver, which has time limits of its own.
     """
-    found = _TCP.fullmatch(endpoint)
+    found = _ENDPOINT.fullmatch(endpoint)
     if found is None:
-        return f"{endpoint}: no link; whether somebody listens there cannot be seen from outside with this protocol"
+        return f"{endpoint}: no link"
     place = _Place(found["host"].strip("[]"), int(found["port"]))
     try:
-        reason = _tls(place, files) if found["protocol"] == "tls" else _plain(place, found["protocol"])
+        match found["protocol"]:
+            case "tls":
+                reason = _tls(place, files)
+            case "udp" | "quic":
+                reason = _datagrams(place)
+            case protocol:
+                reason = _plain(place, protocol)
     except UnicodeError:  # a part of a name has 63 characters at most
         reason = f"{place.host!r} is no name that a machine can have"
     except OSError as error:
@@ -83,6 +91,20 @@ def _unreachable(place: _Place, error: OSError) -> str:
     if error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH):
         return f"no route to {place.host}: is the link up?"
     return f"no connection ({error.strerror or error})"
+
+
+# Without a connection that could be tried
+
+
+def _datagrams(place: _Place) -> str:
+    found = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_STREAM)
+    first, *others = dict.fromkeys(str(one[4][0]) for one in found)
+    reason = "no link; whether somebody listens there cannot be seen from outside with this protocol"
+    if others:
+        reason += (
+            f"; of its addresses {first} alone is tried: if it is dark, connect to {' or '.join(others)}"
+        )
+    return reason
 
 
 # Plain

@@ -140,6 +140,18 @@ def test_a_name_that_nobody_can_have(host: str) -> None:
 def test_what_cannot_be_probed_says_so(fleet: Fleet) -> None:
     """UDP has no connection to refuse: silence would look like a diagnosis that forgot."""
     assert "cannot be seen from outside" in why_no_link("udp/127.0.0.1:7447", _files(fleet))
+    assert "no machine of the name" in why_no_link("quic/no-such-host.invalid:7447", _files(fleet))
+
+
+def test_of_a_name_without_connections_the_address_that_is_tried_is_said(monkeypatch) -> None:
+    """Zenoh takes the first alone over UDP and QUIC: where no packet reaches it, the link never comes."""
+    found = [
+        (socket.AF_INET6, 1, 6, "", ("2001:db8::1", 7447, 0, 0)),
+        (socket.AF_INET, 1, 6, "", ("192.0.2.1", 7447)),
+    ]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    said = why_no_link("udp/ground.example:7447", TlsFiles())
+    assert said.endswith("of its addresses 2001:db8::1 alone is tried: if it is dark, connect to 192.0.2.1")
 
 
 def test_keys_that_vanish_during_a_flight_are_a_sentence(fleet: Fleet, tmp_path: Path) -> None:
