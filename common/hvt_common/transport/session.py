@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from queue import Empty, SimpleQueue
 
 import zenoh
@@ -24,13 +23,12 @@ from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, 
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.transport.inbox import Received, ReceivedQueue
 from hvt_common.transport.link_doctor import link_doctor
-from hvt_common.transport.stale_sockets import StaleSockets, own_sockets
+from hvt_common.transport.stale_sockets import StaleSockets, end_of, ends_of, listening_ends
 from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
 
 _log = logging.getLogger(__name__)
 
 _CLOSE_WITHIN_S = 0.8
-_TCP_LISTEN = "0A"
 _MAY_COME = re.compile(
     "Cannot assign requested address|Address already in use|No such device|Network is (unreachable|down)"
     "|failed to lookup address"
@@ -77,28 +75,17 @@ def _open_listening_later(
     except zenoh.ZError as error:
         raise UserError(_open_failure(str(error), listen, config)) from None
 
-    wanted = {int(found[1]) for endpoint in listen if (found := re.search(r":(\d+)([?#]|$)", endpoint))}
+    wanted = [end_of(endpoint) for endpoint in listen if re.search(r":[1-9]\d*([?#]|$)", endpoint)]
 
     def bound() -> bool:
-        if not wanted <= _listening_ports():
+        here = listening_ends()  # from Linux: Zenoh does not say when its listener has come
+        if not all(here & ends_of(end) for end in wanted):
             raise NotYetError(why)
         return True
 
     part = Awaited(bound, "listener", failures, longest_s=1.0)
     threading.Thread(target=part.wait, args=[stop], name="hvt-listen", daemon=True).start()
     return session
-
-
-def _listening_ports() -> set[int]:
-    # Ports that this process listens on, from Linux: Zenoh does not say when its listener has come.
-    sockets, ports = own_sockets(), set()
-    for table in ("tcp", "tcp6", "udp", "udp6"):
-        with suppress(OSError):  # a kernel without IPv6
-            for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
-                _, local, _, state, *_, inode = line.split()[:10]
-                if int(inode) in sockets and (state == _TCP_LISTEN or table.startswith("udp")):
-                    ports.add(int(local.rpartition(":")[2], 16))
-    return ports
 
 
 def loses_declarations(settings: LinkSettings, session: zenoh.Session) -> Callable[[], bool]:

@@ -22,6 +22,7 @@ import zenoh
 from hvt_common.transport.zenoh_config import connect_endpoints
 
 TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
+UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 
 _EVERY_S = 0.25
 _HANGS_S = 0.5
@@ -31,6 +32,7 @@ _LINGER, _NO_LINGER = struct.pack("ii", 1, 10), struct.pack("ii", 0, 0)
 _LAST_DATA_RECEIVED = 52
 """Offset of ``tcpi_last_data_recv`` (ms) in Linux's ``struct tcp_info``."""
 _FAMILIES = (socket.AF_INET, socket.AF_INET6)
+_LISTENING = "0A"
 _CONNECTS, _NEW = 2, 7
 _UNCONNECTED = (_CONNECTS, _NEW, 10)
 """States of Linux's TCP: a socket that connects, is new or listens has no other end that it could name."""
@@ -52,8 +54,29 @@ def connections(table: Path, *, inodes: Container[str] | None = None) -> Iterato
     """What one of `TCP_TABLES` has, but listening sockets; with ``inodes`` those alone, quickly out of thousands."""
     for line in table.read_text(encoding="ascii").splitlines()[1:]:
         _, ours, theirs, state, *_, inode = line.split(maxsplit=10)[:10]
-        if state != "0A" and (inodes is None or inode in inodes):
+        if state != _LISTENING and (inodes is None or inode in inodes):
             yield Connection(_end(ours), _end(theirs), int(inode))
+
+
+def listening_ends() -> set[str]:
+    """Where sockets of this process listen or take datagrams."""
+    own, found = own_sockets(), set()
+    for table in (*TCP_TABLES, *UDP_TABLES):
+        with suppress(OSError):  # a kernel without IPv6
+            for line in table.read_text(encoding="ascii").splitlines()[1:]:
+                _, ours, _, state, *_, inode = line.split(maxsplit=10)[:10]
+                if int(inode) in own and (state == _LISTENING or table in UDP_TABLES):
+                    found.add(_end(ours))
+    return found
+
+
+def ends_of(end: str) -> set[str]:
+    """All that an end stands for, whose host may be a name; nothing where nobody knows it."""
+    host, _, port = end.rpartition(":")
+    with suppress(OSError, UnicodeError):
+        found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
+        return {_end_of_name(one[4]) for one in found}
+    return set()
 
 
 def end_of(locator: object) -> str:
@@ -194,12 +217,9 @@ class StaleSockets:
 
     def _probe_others(self, theirs: str) -> None:
         for place in self._places:
-            host, _, port = place.rpartition(":")
-            with suppress(OSError, UnicodeError):
-                found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
-                ends = {_end_of_name(one[4]) for one in found}
-                if theirs in ends:
-                    self._same_name[theirs] = sorted(ends - {theirs})
+            ends = ends_of(place)
+            if theirs in ends:
+                self._same_name[theirs] = sorted(ends - {theirs})
         for one in self._same_name.get(theirs, ()):
             threading.Thread(target=self._probe, args=[one], name="hvt-probe", daemon=True).start()
 

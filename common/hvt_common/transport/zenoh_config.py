@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -88,7 +90,9 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     for path, value in {**_DEFAULTS, **(_CLIENT if settings.role == "client" else {})}.items():
         if not _mentions(said, path):
             config.insert_json5(path, json.dumps(value))
-    listen, connect = settings.listen, settings.connect
+    listen, connect = (tuple(dict.fromkeys(side)) for side in (settings.listen, settings.connect))
+    whole = {one.replace("/[::]:", "/0.0.0.0:") for one in listen if "/[::]:" in one}
+    listen = tuple(one for one in listen if one not in whole)  # [::] takes IPv4 too, on the same port
     file_listen = _endpoints(said, "listen")
     if not (listen or connect or file_listen or _endpoints(said, "connect")):
         listen = (DEFAULT_ENDPOINT,) if settings.role == "ground" else ()
@@ -221,12 +225,21 @@ def _check_endpoint(endpoint: str) -> None:
 def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) -> None:
     import zenoh  # noqa: PLC0415
 
-    scoped = [_SCOPE.sub(r"\1\3#iface=\2;", one).rstrip(";") for one in endpoints]
+    scoped = [_scoped(one, listening=side == "listen") for one in endpoints]
     try:
         config.insert_json5(f"{side}/endpoints", json.dumps(scoped))
     except zenoh.ZError as error:  # what stands behind ? and # is Zenoh's to judge
         reason = without_build_paths(re.sub(r".*msg: \"|\", location: .*", "", str(error)))
         raise UserError(f"--{side} {' '.join(endpoints)}: Zenoh does not accept it: {reason}") from None
+
+
+def _scoped(endpoint: str, *, listening: bool) -> str:
+    found = _SCOPE.search(endpoint)
+    if listening and found and endpoint.startswith(("udp/", "quic/")):
+        # There Zenoh binds the address before the interface, and Linux wants to know which it is.
+        with suppress(OSError):
+            return endpoint.replace(f"%{found[2]}]", f"%{socket.if_nametoindex(found[2])}]")
+    return _SCOPE.sub(r"\1\3#iface=\2;", endpoint).rstrip(";")
 
 
 def _check_reach(endpoint: str, *, allowed: bool) -> None:

@@ -216,6 +216,21 @@ def test_a_link_local_endpoint_names_its_interface(given, zenohs):
     assert connect_endpoints(config)[0].partition("#")[0] == given.partition("#")[0]
 
 
+def test_a_link_local_datagram_listener_is_bound_by_the_number_of_its_interface():
+    """Zenoh binds the address first, and Linux refuses one of which it does not know the interface."""
+    for given, zenohs in (("lo", "%1]:7447"), ("no-such-if", "]:7447#iface=no-such-if")):
+        config, _ = configure(LinkSettings("ground", listen=(f"udp/[fe80::1%{given}]:7447",), insecure=True))
+        assert json.loads(config.get_json("listen/endpoints")) == [f"udp/[fe80::1{zenohs}"]
+
+
+def test_what_is_given_twice_is_opened_once():
+    """A port in use would be waited for that this very program holds, and a second link to one place be missed."""
+    wild = ("tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/0.0.0.0:7447", "tcp/0.0.0.0:7448", "tcp/[::]:7447")
+    config, listen = configure(LinkSettings("ground", listen=wild, connect=("tcp/h:1",) * 2, insecure=True))
+    assert listen == wild[1:4]
+    assert json.loads(config.get_json("connect/endpoints")) == ["tcp/h:1"]
+
+
 def test_tls_links_do_not_hide_seconds_of_video_in_the_kernel():
     """The socket of a full TLS link would grow to megabytes, and every picture be seconds old."""
     config, _ = configure(LinkSettings("edge"))

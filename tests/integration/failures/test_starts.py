@@ -134,11 +134,12 @@ def test_an_address_that_is_not_there_yet_is_no_wrong_setting(open_it, at, says,
 
 
 def test_a_link_waits_for_an_address(caplog):
-    """The same, of the link."""
+    """The same, of the link, also where this program listens on that port of another address."""
     failures = Failures(time.time_ns)
-    settings = LinkSettings(role="ground", listen=("tcp/192.0.2.1:7447",), insecure=True)
-    with open_session(settings, failures=failures):
-        assert "this machine has no such address" in failures.now[0].reason
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        there = (f"tcp/192.0.2.1:{other.getsockname()[1]}",)
+        with open_session(LinkSettings(role="ground", listen=there, insecure=True), failures=failures):
+            assert "this machine has no such address" in failures.now[0].reason
 
 
 def test_the_viewer_waits_for_its_port(caplog):
