@@ -197,7 +197,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(answer.body)))
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
-        self.wfile.write(answer.body)
+        if self.command == "GET":
+            self.wfile.write(answer.body)
+
+    do_HEAD = do_GET  # noqa: N815 - http.server's name; probes that need no answer's body send it
 
     def _answer(self) -> Answer:
         # A browser always says which host it asks for, a probe may say nothing.

@@ -70,6 +70,19 @@ def test_state_is_told_under_names_of_this_machine_alone(served_at, names, stran
         assert {one: asked(port, one) for one in strangers} == dict.fromkeys(strangers, 403)
 
 
+def test_a_probe_may_ask_by_head():
+    """`curl -I` and load balancers were told 501, and took a ground that is well for one that is down."""
+    (port,) = free_ports(1)
+    with HealthServer(f"127.0.0.1:{port}", STATE, failures=Failures(time.time_ns)):
+        eventually(lambda: answers(port), what="it serves")
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+        connection.request("HEAD", "/state.json")
+        answer = connection.getresponse()
+        length = len(STATE["/state.json"]().body)
+        assert (answer.status, answer.headers["Content-Length"], answer.read()) == (200, str(length), b"")
+        connection.close()
+
+
 def test_threads_and_descriptors_that_are_used_up_for_a_while(monkeypatch):
     """The port would answer nobody for the rest of the flight, or take a core from video."""
     (port,) = free_ports(1)
