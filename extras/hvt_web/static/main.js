@@ -252,6 +252,8 @@ function showAge() {
   stage.dataset.state = name;
   stage.classList.toggle("old", !live && shown.frame >= 0 && name !== "paused");
   by("standing").textContent = said;
+  const spoken = words.spokenWords(said, state?.failed ?? []);
+  if (by("spoken").textContent !== spoken) by("spoken").textContent = spoken;
   const gone = name === "gone";
   showBehind();
   by("on-link").textContent = state && !gone && name !== "lost" ? state.short : "";

@@ -91,6 +91,12 @@ export function standing(facts) {
 }
 
 /**
+ * To who listens, when it changes: without the times, which are others each moment.
+ * @param {string} said of the picture @param {string[]} failed
+ */
+export const spokenWords = (said, failed) => [said, ...failed].join(". ").replace(/,?( picture| for)? \d[\d.]* (s|min|h)( old)?(?=\.|$)/g, "");
+
+/**
  * In the middle of an empty picture, by the state.
  * @param {string} state
  */
