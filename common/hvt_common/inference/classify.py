@@ -104,8 +104,13 @@ class OnnxClassifier:
             crops = [self._prepared(crop) for crop in crops_bgr[start : start + batch]]
             missing = self._batch - len(crops) if self._batch else 0
             stack = np.stack(crops + crops[:1] * missing)
-            rows = self._probabilities(self.model.run(stack)[self._output_index])[: len(crops)]
-            posteriors += [self._posterior(row) for row in rows]
+            output = self.model.run(stack)[self._output_index]
+            if output.size != len(stack) * len(self.class_names) or len(output) != len(stack):
+                raise UserError(
+                    f"model {self.model.path} answers {len(stack)} crops with {output.shape}, and has"
+                    f" {len(self.class_names)} classes"
+                )
+            posteriors += [self._posterior(row) for row in self._probabilities(output)[: len(crops)]]
         return posteriors
 
     def _prepared(self, crop_bgr: Image) -> npt.NDArray[Any]:
@@ -181,11 +186,11 @@ class OnnxClassifier:
 def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
     # Whether channels come first, the batch (None: free), and the (width, height) of the input.
     shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
-    if len(shape) != 4 or 3 not in (shape[1], shape[3]):
+    if len(shape) != 4 or (3 not in (shape[1], shape[3]) and shape[1] is not None):
         raise UserError(_not_a_classifier(model, "its input is not one image of three channels"))
     if model.inputs[0].dtype not in (np.float32, np.float16, np.uint8):
         raise UserError(_not_a_classifier(model, "its input is neither float32, float16 nor uint8"))
-    channels_first = shape[1] == 3
+    channels_first = shape[1] == 3 or shape[3] != 3
     said = [int(word) for word in re.findall(r"\d{2,4}", model.metadata.get("imgsz", ""))]  # height, width
     usual = (said * 2)[:2] if said else [_USUAL_SIDE, _USUAL_SIDE]
     declared = shape[2:] if channels_first else shape[1:3]

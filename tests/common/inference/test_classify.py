@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 from onnx import TensorProto
 
@@ -230,6 +232,28 @@ def test_what_is_no_classifier_is_refused_in_one_sentence(tmp_path: Path) -> Non
         assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match="does not exist"):
         open_classifier(str(tmp_path / "none.onnx"))
+
+
+def test_an_input_without_declared_sizes_is_taken(tmp_path: Path) -> None:
+    """As transformers' exporter declares them all: it was refused."""
+    path = colour_classifier(tmp_path / "c.onnx")
+    model = onnx.load(path)
+    for number, axis in enumerate(model.graph.input[0].type.tensor_type.shape.dim):
+        axis.dim_param = f"free{number}"
+    onnx.save(model, path)
+    red = np.zeros((9, 9, 3), np.uint8)
+    red[..., 2] = 255
+    assert open_classifier(str(path)).classify([red])[0].class_name == "class 0"
+
+
+def test_an_answer_of_other_classes_is_refused_in_words(tmp_path: Path) -> None:
+    """A crop would get the name of another class."""
+    classifier = open_classifier(str(colour_classifier(tmp_path / "c.onnx")))
+    assert isinstance(classifier, OnnxClassifier)
+    for shape in ((1, 2), (0, 3), (3,)):
+        classifier.model.runner = SimpleNamespace(run=lambda _, shape=shape: [np.ones(shape)])
+        with pytest.raises(UserError, match=r"c\.onnx answers 1 crops with \(.*\), and has 3 classes"):
+            classifier.classify([np.zeros((9, 9, 3), np.uint8)])
 
 
 @pytest.mark.parametrize(
