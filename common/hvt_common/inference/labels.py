@@ -40,6 +40,7 @@ _MAX_METADATA_CHARS = 1 << 20
 _NAME = re.compile(r"[\w .&'/+-]*[^\W\d_][\w .&'/+-]*")
 """Between commas or line ends, without brackets around."""
 _NUMBERED = re.compile(r"(\d+)\s*[:=,;.)\s]\s*(\S.*)")
+_MARKED = re.compile(r"""(?=[-'"])(?:- +)?(['"]?)(\S.*?)\1""")
 _SYNSET = re.compile(r"n\d{8}\s+")
 _PLAIN_LIST = re.compile(r"\[([^][{}'\":]*[^\W\d][^][{}'\":]*)\]")
 """YAML's, without quotes."""
@@ -81,16 +82,16 @@ def read_labels(path: Path) -> tuple[str, ...]:
 
 
 def _without_numbers(names: Sequence[str]) -> tuple[str, ...]:
-    # ``0 car``, ``1: bus``, ``- car`` or ``n02084071 dog``; what stands before all names is none of theirs.
-    if all(name.startswith("- ") for name in names):
-        return tuple(name[2:].strip(" '\"") or name for name in names)
+    # ``0 car``, ``1: bus`` in any order, ``- car``, ``"car"`` or ``n02084071 dog``: what marks every line is no name.
+    if all(map(_MARKED.fullmatch, names)):
+        return tuple(_MARKED.sub(r"\2", name) for name in names)
     if all(map(_SYNSET.match, names)):
         return tuple(_SYNSET.sub("", name) for name in names)
-    found = [_NUMBERED.fullmatch(name) for name in names]
-    numbers = [int(one[1]) for one in found if one]
+    found = sorted((int(one[1]), one[2]) for one in map(_NUMBERED.fullmatch, names) if one)
+    numbers = [number for number, _ in found]
     if len(names) < 2 or numbers not in (list(range(len(names))), list(range(1, len(names) + 1))):
         return tuple(names)
-    return tuple(one[2] for one in found if one)
+    return tuple(name for _, name in found)
 
 
 def class_labels(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...] | None:

@@ -322,6 +322,12 @@ def _session(
         )
     except _ort_errors() as error:
         raise UserError(f"model {path} cannot be opened: {_cause(path, error)}") from error
+    for value in (*session.get_inputs(), *session.get_outputs()):
+        if not value.type.startswith("tensor("):
+            raise UserError(
+                f"model {path} has {value.name!r:.40}, a {value.type:.80}; tensors are accepted: export it without"
+                " ZipMap, or without lists"
+            )
     _check_ports(path, tuple(map(_port, session.get_inputs())), tuple(map(_port, session.get_outputs())))
     return session
 

@@ -52,6 +52,17 @@ _INSIDE: Mapping[str, Mapping[int, str]] = MappingProxyType(
 _TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 13, 14
 _FIXED_BYTES = {1: 8, 5: 4}
 
+_OTHERS: Mapping[bytes, str] = MappingProxyType(
+    {
+        rb"version https://git-lfs": "but Git LFS's pointer to one: git lfs pull brings it",
+        rb"\s*<[!?a-zA-Z]": "but a web page or XML",
+        rb"PK\x03\x04": "but a zip archive, as PyTorch's .pt is: export it as ONNX",
+        rb"....TFL3": "but TensorFlow Lite's: export it as ONNX",
+        rb"\x89HDF": "but Keras's: export it as ONNX",
+    }
+)
+"""What is given in place of a model, by how it begins."""
+
 _YOUNG_NS = 2 * SECOND_NS
 """Within that a file may be written again without another time: that is of 10 ms, or of 2 s (FAT)."""
 
@@ -122,7 +133,9 @@ def _check(path: Path, data: mmap.mmap) -> None:
         fields = set(_model_fields(data))
         location = _external_location(data, 0, len(data), "Model", depth=0)
     except ValueError as error:
-        raise UserError(f"model {path} is not an ONNX file, or is cut short ({error})") from error
+        known = (word for mark, word in _OTHERS.items() if re.match(mark, data[:64], re.DOTALL))
+        what = next(known, f"or is cut short ({error})")
+        raise UserError(f"model {path} is not an ONNX file, {what}") from error
     if GRAPH_FIELD not in fields:
         raise UserError(f"model {path} is not an ONNX file (no graph in it)")
     if location is not None:

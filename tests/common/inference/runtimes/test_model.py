@@ -91,6 +91,22 @@ def test_what_is_no_model_is_refused_in_one_sentence(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("begin", "words"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid", "but Git LFS's pointer"),
+        (b"\n<!DOCTYPE html>", "but a web page"),
+        (b"PK\x03\x04\x14\0", "but a zip archive"),
+        (b"\x1c\0\0\0TFL3", "but TensorFlow Lite's"),
+    ],
+)
+def test_what_was_given_in_place_of_a_model_is_named(tmp_path: Path, begin: bytes, words: str) -> None:
+    """Nobody learns from a "wire type" that a download brought a page or a pointer."""
+    (tmp_path / "m.onnx").write_bytes(begin.ljust(200, b"x"))
+    with pytest.raises(UserError, match=f"m.onnx is not an ONNX file, {words}"):
+        open_model(tmp_path / "m.onnx")
+
+
 def test_a_file_over_the_cap_is_not_even_parsed(tmp_path: Path) -> None:
     """A wrong path to a huge file would fill the drone's memory."""
     path = tmp_path / "huge.onnx"
@@ -258,6 +274,14 @@ def sentence(path: Path) -> str:
 def test_absurd_ports_are_refused(tmp_path, declared, words):
     """The first frame would ask for a hundred gigabytes, in flight."""
     assert words in sentence(same(tmp_path / "m.onnx", **declared))
+
+
+def test_a_list_among_the_outputs_is_refused(tmp_path):
+    """A classifier of scikit-learn's exporter ended the program in a traceback."""
+    out = helper.make_tensor_sequence_value_info("listed", TensorProto.FLOAT, (1, 3, 8, 8))
+    node = helper.make_node("SequenceConstruct", ["x"], ["listed"])
+    path = written(tmp_path / "m.onnx", [node], [PORT("x", TensorProto.FLOAT, (1, 3, 8, 8))], [out])
+    assert "has 'listed', a seq(tensor(float)); tensors are accepted: export it without" in sentence(path)
 
 
 def test_a_large_picture_is_no_absurd_port(tmp_path):
