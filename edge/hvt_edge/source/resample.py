@@ -49,7 +49,7 @@ def hold(
 
     At each index that is the latest frame at or before index / fps; the first is the clip's zero, and the last is
     shown for ``tail_s``. A frame that does not come after its predecessor replaces it. A time stamp ``slack_s`` too
-    late still counts as on time: Matroska rounds times to milliseconds, and 2/30 s becomes 0.067 s.
+    late still counts as on time: rounded to milliseconds, 2/30 s becomes 0.067 s.
     """
     slack = min(slack_s, 1 / (4 * fps))
     index = 0

@@ -74,7 +74,7 @@ class VideoSource(ClipSource):
         container, stream = open_video(self._spec)
         with container:
             times = [at_s for at_s, _ in decoded(container, stream, name=self._name, stamps=self._stamps)]
-            slack_s = Fraction(stream.time_base or 0) if self._stamps.usable else Fraction(0)
+            slack_s = self._stamps.slack_s(stream)
         timed = ((at_s, index) for index, at_s in enumerate(times))
         held = hold(timed, fps=exact_rate(self.fps), tail_s=self._stamps.period_s, slack_s=slack_s)
         return len(times), tuple(index for _, index in held)
@@ -85,7 +85,7 @@ class VideoSource(ClipSource):
         self._pictures.begin(stream)
         stamps = self._stamps
         with container, closing(decoded(container, stream, name=self._name, stamps=stamps)) as frames:
-            slack_s = Fraction(stream.time_base or 0) if stamps.usable else Fraction(0)
+            slack_s = stamps.slack_s(stream)
             held: tuple[av.VideoFrame, Frame] | None = None
             stamped = self._shown(frames)
             for index, frame in hold(stamped, fps=base_rate, tail_s=stamps.period_s, slack_s=slack_s):

@@ -43,7 +43,8 @@ _SURVEYED = 256
 """Packets at the start of a clip whose stamps are looked at."""
 QUIET_S, _POLL_S = 10.0, 0.1
 """A file that has not grown for so long has ended."""
-_MOST_BOXES = 64
+_MOST_BOXES = 2**16
+"""Nine hours of fragments, a second each."""
 DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
 """A sender of MPEG-TS that begins anew may number its film otherwise: it is the same film to a viewer."""
 _FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0", "m3u8_hold_counters": "3"}
@@ -272,7 +273,8 @@ class _Reading:
 
     def faults(self) -> Iterator[str]:
         if self._damaged:
-            yield f"has {self._damaged} damaged packets, which were skipped"
+            codec = self._stream.codec_context.name
+            yield f"has {self._damaged} packets, damaged or of another codec than {codec}, which were skipped"
         if self._shown_damaged:
             yield f"has {self._shown_damaged} damaged pictures, shown as the decoder has patched them"
         if self._lossy:
@@ -314,7 +316,11 @@ class _Reading:
         joined = (
             "mp4" in name and _boxes_of(Path(self._container.name.removeprefix("file:"))).count(b"moov") > 1
         )
-        ends = name in _WITHOUT_INDEX or (joined and self._stream.frames)
+        if joined and not self._stream.frames:
+            return (
+                "another recording is behind it, in fragments that FFmpeg reads as if they were of the first"
+            )
+        ends = name in _WITHOUT_INDEX or joined
         behind = 1 - self._end_byte / size if size and ends else 0
         if behind > _MOST_BEHIND:
             return f"its last {behind:.0%} hold nothing of this film, but perhaps another recording"

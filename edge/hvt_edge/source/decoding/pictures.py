@@ -26,6 +26,8 @@ _UNTAGGED_SD_PX = 576
 """A picture that says no colour matrix is BT.601 with at most so many lines, else BT.709: as players take it."""
 _DEEP_BITS = 10
 """Grey of more is a sensor's levels, not brightness."""
+_COLOURS = 3
+"""Components of a pixel in colour: a palette has one, grey with transparency two."""
 _HDR = {16: "PQ", 18: "HLG"}
 """Transfers of ITU-T H.273, table 3."""
 _BT709, _BT601 = 1, 6
@@ -138,7 +140,7 @@ class Pictures:
             own = np.asarray(levels, np.uint16) >> (16 - bits)
             return self._stretch.bgr(own, at_s=frame.time or 0.0, bits=bits)
         more: dict[str, Any] = {}
-        if not name.startswith("gray"):
+        if len(components) >= _COLOURS:
             if not frame.format.is_rgb and frame.colorspace not in _CONVERTED:
                 matrix = matrix_of(frame)
                 standard = "BT.709" if matrix == _BT709 else "BT.601"

@@ -18,6 +18,8 @@ _LONG_STEPS = 3
 _FEW = 8
 """After so many stamps that do not rise, the stream has none."""
 _SAME = Fraction(2, 100)
+_ROUNDED_S = Fraction(1, 1000)
+"""Matroska, FLV and ASF round times to milliseconds, and what is made of them keeps these in finer units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +38,10 @@ class Stamps:
     def timeline(self, stream: Any) -> Timeline:
         quantum_s = stream.time_base if self.usable else None
         return Timeline(self.period_s, quantum_s=quantum_s, long_s=self.long_s)
+
+    def slack_s(self, stream: Any) -> Fraction:
+        """By how much rounding may have made a stamp late."""
+        return max(_ROUNDED_S, Fraction(stream.time_base or 0)) if self.usable else Fraction(0)
 
 
 def surveyed(

@@ -43,6 +43,13 @@ def test_avi_with_b_frames_plays_every_frame_once(tmp_path):
     assert "AVI has time stamps of the decoding alone" in " ".join(source.notes)
 
 
+def test_times_in_whole_milliseconds_lose_no_frame_in_a_finer_unit(tmp_path):
+    """Each third frame of a Matroska recording that was put into an MP4 as it is was lost, and others shown twice."""
+    times = [round(one * 1000 / 30) for one in range(60)]
+    clip = write_numbered(tmp_path / "a.mp4", 60, times_ms=times, bf="0")
+    assert numbers(play(clip)[1]) == list(range(60))
+
+
 @pytest.mark.parametrize("late", [1, 30, 59])
 def test_a_stamp_far_ahead_repeats_no_picture(tmp_path, late):
     """A picture would be shown for ten hours."""
@@ -366,6 +373,13 @@ def test_untagged_colour_goes_by_height(tmp_path, size, standard):
     source, pictures = play(clip)
     assert patch(pictures[0], right=False) == pytest.approx((0, 191, 0), abs=6)
     assert f"no colour matrix: {standard}, because it has {size[1]} lines" in " ".join(source.notes)
+
+
+@pytest.mark.parametrize("mode", ["P", "LA", "1"])
+def test_no_matrix_is_missed_where_none_can_be(tmp_path, mode):
+    """Who is told of a guess at the colours of a palette looks for a fault that there is not."""
+    Image.new(mode, (160, 120)).save(tmp_path / "a.png")
+    assert "matrix" not in " ".join(play(tmp_path / "a.png")[0].notes)
 
 
 # -- damage -------------------------------------------------------------------

@@ -77,6 +77,22 @@ def test_a_recording_behind_the_film_is_said(tmp_path, caplog, ending, options):
     assert "hold nothing of this film, but perhaps another recording" in caplog.text
 
 
+def test_fragments_of_another_recording_are_said(tmp_path, caplog):
+    """The first of them was lost, and those of another size were garbage, without a word."""
+    fragmented = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
+    play(put_together(tmp_path, "mp4", settings=(fragmented, fragmented)))
+    assert "both.mp4 is unfinished: another recording is behind it" in caplog.text
+
+
+def test_another_codec_in_the_midst_is_not_called_damage_alone(tmp_path, caplog):
+    """Who looks for a fault of the disk or the link would look in vain."""
+    write(tmp_path / "0.ts", range(30))
+    write(tmp_path / "1.ts", range(30), codec="mpeg2video")
+    (tmp_path / "a.ts").write_bytes(b"".join((tmp_path / f"{one}.ts").read_bytes() for one in range(2)))
+    play(tmp_path / "a.ts")
+    assert "packets, damaged or of another codec than h264, which were skipped" in caplog.text
+
+
 def test_packets_that_a_recorder_lost_are_said(tmp_path, caplog):
     """H.264 over a gap is smeared up to its next keyframe, and no picture of it is marked as damaged."""
     write(tmp_path / "a.ts", range(30), group=30)
