@@ -10,7 +10,7 @@ _FULL_FRAME_MM = 36.0
 """Width of the picture that 35 mm equivalent focal lengths are said for."""
 _OVERSHOT_DEG = 92.0
 """So far a gimbal's pitch goes where it means straight down or up."""
-_NUMBER = r"[+-]?\d+(?:[.,]\d+)?"
+_NUMBER = r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?"
 """With a point, or with the comma that half of Europe writes."""
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048

@@ -264,6 +264,11 @@ def blocks(make, count=4):
         ("GPS(11,5000,48,1000,16) BAROMETER:50,5", (48.1, 11.5, 50.5), "longitude, latitude, satellites"),
         ("GPS (11,5000, 48,1000, 16)", (48.1, 11.5, None), "longitude, latitude, satellites"),
         ("GPS(48,1000,11,5000,20,5M)", (48.1, 11.5, None), "latitude, longitude, height"),
+        (
+            "[latitude: 51.4779] [longitude: -1.5e-05] [rel_alt: 50.5 abs_alt: 9]",
+            (51.4779, -1.5e-5, 50.5),
+            "",
+        ),
         ("[latitude: 48,1000] [longitude: 11,5000] [rel_alt: 50,5 abs_alt: 570,2]", (48.1, 11.5, 50.5), ""),
         (
             "[latitude : -34.5] [longtitude : -58.5] [altitude: 74.7]",
