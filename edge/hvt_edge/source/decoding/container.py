@@ -237,6 +237,8 @@ def decoded(
             _log.warning("%s: %s", name, timeline.says)
     if len(timeline.jumps) > 1:
         _log.warning("%s: its time stamps jumped %d times in all", name, len(timeline.jumps))
+    if timeline.jumps and before_s is not None:
+        reading.end_s = before_s + stamps.period_s
     for sentence in reading.faults():
         _log.warning("%s %s", name, sentence)
 
@@ -247,7 +249,8 @@ class _Reading:
         self._size = _size_of(container)
         self._damaged = self._shown_damaged = self._count = self._lossy = 0
         self._ended = ""
-        self._end_s: Fraction | None = None
+        self.end_s: Fraction | None = None
+        """By its time stamps, as far as these go on."""
         self._end_byte = 0
 
     def frames(self) -> Iterator[av.VideoFrame]:
@@ -262,7 +265,7 @@ class _Reading:
                 stamp = packet.dts if packet.pts is None else packet.pts
                 if stamp is not None:
                     end_s = Fraction(stamp + (packet.duration or 0)) * (packet.time_base or 0)
-                    self._end_s = max(end_s, self._end_s or end_s)
+                    self.end_s = max(end_s, self.end_s or end_s)
             try:
                 frames = _decode(self._stream, packet)
             except av.error.FFmpegError:
@@ -298,8 +301,8 @@ class _Reading:
         begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
         # That of the container may be that of the sound.
         said_s = duration_s(stream) if stream.duration or len(container.streams) == 1 else None
-        if said_s is not None and self._end_s is not None:
-            missing_s = said_s - (self._end_s - begin_s)
+        if said_s is not None and self.end_s is not None:
+            missing_s = said_s - (self.end_s - begin_s)
             if missing_s > 1 and missing_s > said_s / 50:
                 return f"it ends {float(missing_s):.1f} s before the end that its header says"
         return ""
@@ -308,7 +311,7 @@ class _Reading:
         if self._container.format.name != "avi":
             return self._count
         # With those that its recorder dropped, as the places of the others say.
-        return max(self._count, math.ceil((self._end_s or 0) * (self._stream.average_rate or 0)))
+        return max(self._count, math.ceil((self.end_s or 0) * (self._stream.average_rate or 0)))
 
     def _lacks_pictures(self) -> str:
         # The same of formats without an index, and of two MP4 put together, by their bytes.

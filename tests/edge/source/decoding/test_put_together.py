@@ -65,6 +65,15 @@ def test_a_playlist_without_its_end_plays_from_its_beginning(tmp_path, growing):
     assert [number_of(one) for one in play(playlist, growing=growing)] == list(range(30))
 
 
+def test_a_playlist_whose_time_begins_anew_is_whole(tmp_path, caplog):
+    """It was played to its end, and called unfinished."""
+    put_together(tmp_path, "ts")
+    parts = "#EXTINF:2,\n0.ts\n#EXT-X-DISCONTINUITY\n#EXTINF:2,\n1.ts\n"
+    (tmp_path / "a.m3u8").write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:2\n{parts}#EXT-X-ENDLIST\n")
+    assert [number_of(one) for one in play(tmp_path / "a.m3u8")] == list(range(120))
+    assert "unfinished" not in caplog.text
+
+
 @pytest.mark.parametrize(
     ("ending", "options"), [("ts", {"mpegts_pmt_start_pid": "4200"}), ("flv", {}), ("mp4", {})]
 )
