@@ -161,14 +161,13 @@ def rate_of(name: str, units: Sequence[SeenUnit], *, said: float | None) -> floa
 class CameraDecoder:
     """Takes packets in their order; gives each unit that can be sent with its picture. One thread.
 
-    What does not hold is left out up to the next keyframe, as a ground would have to. With ``size`` (width, height) a
-    picture of another is not taken either; where it is not known yet, `expect` says it later.
+    What does not hold is left out up to the next keyframe, as a ground would have to.
     """
 
-    def __init__(self, units: CameraUnits, *, size: tuple[int, int] | None = None) -> None:
+    def __init__(self, units: CameraUnits) -> None:
         self._units = units
-        self._decoder = BaseDecoder(size=size)
-        self._size = size
+        self._decoder = BaseDecoder()  # of any size: of a larger one it would say no more than that it fails
+        self._size: tuple[int, int] | None = None
         self._whole = False
         """Whether all since a keyframe was decoded."""
         self.trouble = ""
@@ -176,7 +175,7 @@ class CameraDecoder:
         self.is_other = False
         """Whether that one is whole, and of another size or format than is taken."""
 
-    def expect(self, size: tuple[int, int]) -> None:
+    def expect(self, size: tuple[int, int] | None) -> None:
         """From now on a picture of another size (width, height) is not taken."""
         self._size = size
 

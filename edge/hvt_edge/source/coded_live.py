@@ -48,7 +48,9 @@ class CodedStreamGrabber(StreamGrabber):
     def _read(self, container: Any, stream: Any) -> Iterator[Shot]:
         check_stream(self.name, stream)
         self.said_fps = float(stream.average_rate or 0) or None
-        return _packets(container, stream, CameraDecoder(open_units(self.name, stream), size=self.size))
+        decoder = CameraDecoder(open_units(self.name, stream))
+        decoder.expect(self.size)
+        return _packets(container, stream, decoder)
 
 
 def _packets(container: Any, stream: Any, decoder: CameraDecoder) -> Iterator[Shot]:

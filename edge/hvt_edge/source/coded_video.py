@@ -88,7 +88,8 @@ class CodedVideoSource(ClipSource):
     def _play(self, start_ns: int) -> Generator[Frame, None, None]:
         container, stream = open_video(self._spec, growing=self._growing)
         left_out, before, count, zero_s, begun, last_ns = 0, 0, 0, 0.0, False, -1
-        decoder = CameraDecoder(open_units(self._name, stream), size=self._size)
+        decoder = CameraDecoder(open_units(self._name, stream))
+        decoder.expect(self._size)
         packets = self._timed(container, stream, say=True)
         with container, closing(packets):
             for at_s, packet in packets:
