@@ -75,7 +75,7 @@ _ALL = (
         any_size=True,
     ),
     Method("R0", Kind.VIDEO, "video that spends more on tracks", ("--method", "R0")),
-    _stills("M1", "a still of each track every second"),
+    _stills("M1", "a still of each track every second, once it would gain"),
     _stills("M2", "a still when a track begins"),
     _stills("M3", "a still of tracks that are uncertain"),
     _stills("M4", "a still of tracks that are small"),

@@ -175,6 +175,20 @@ def test_what_a_layout_lacks_is_one_sentence(tmp_path, spoil, said):
     assert str(root) in str(caught.value)
 
 
+def test_annotations_without_an_object_are_refused(tmp_path):
+    """Every box over an empty file of UAVDT was false; of MOTChallenge it was said that classes do not match."""
+    root = tmp_path / "root"
+    write_visdrone(tmp_path / "drone", "a")
+    shutil.copytree(tmp_path / "drone" / "sequences" / "a", root / "M0203" / "img1")
+    (root / "M0203_gt_whole.txt").write_text("")
+    (root / "M0203" / "gt").mkdir()
+    (root / "M0203" / "gt" / "gt.txt").write_text("\n")
+    (root / "M0203" / "gt" / "labels.txt").write_text("car\n")
+    for uri in (f"uavdt:{root}", f"mot:{root}?fps=30"):
+        with pytest.raises(UserError, match=r"annotations .* are empty"):
+            open_dataset(uri)
+
+
 @pytest.mark.parametrize(
     ("uri", "said"),
     [

@@ -68,12 +68,18 @@ class ImageSequence:
     ) -> Sequence:
         """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown.
 
-        Raises `UserError` where labels count frames from another number on than images: all would be of other images.
+        Raises `UserError` where labels have nothing in them, and every box would be false; or count frames from
+        another number on than images, and all would be of other images.
         """
         frame_count = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
         known = None if labels is None else labels.table()
         begins, count = self.first_number, self.frame_count
         first, last = (None, 0) if known is None else (known.first_frame, known.last_frame)
+        if labels is not None and first is None:
+            raise UserError(
+                f"annotations {labels.arguments[0]} are empty: accepted are objects or regions within the pictures, "
+                "or ?labels=none, for pictures alone"
+            )
         if first is not None and (
             not (begins <= last and first < begins + count)
             or (first < begins and (begins == 1 or last - count in (-1, 0)))

@@ -38,7 +38,6 @@ from hvt_study.datasets.sequence import Sequence
 
 _FPS = 30.0
 """The dataset does not say; its drones filmed at 24 to 30."""
-_COLUMNS = "frame,id,x,y,w,h,score,category,truncation,occlusion"
 _LAYOUT = "sequences/NAME/0000001.jpg and annotations/NAME.txt"
 
 
@@ -69,8 +68,6 @@ def _open(name: str, folder: Path, annotations: Path, options: Options) -> Seque
         if not annotations.is_file():
             raise missing_labels(f"VisDrone sequence {folder}", annotations)
         labels = TableLabels(video_table, (annotations, images.size), images.first_number)
-        if labels.table().first_frame is None:
-            raise UserError(f"annotations {annotations} are empty: expected are lines of {_COLUMNS}")
     return images.sequence(name=name, dataset="visdrone", fps=options.fps or _FPS, labels=labels)
 
 
