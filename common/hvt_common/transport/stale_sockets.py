@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import ipaddress
+import logging
 import os
 import re
 import socket
@@ -11,7 +12,7 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +22,13 @@ import zenoh
 
 from hvt_common.transport.zenoh_config import connect_endpoints
 
+_log = logging.getLogger(__name__)
+
 TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 
 _EVERY_S = 0.25
+_UNREAD_EVERY_S, _UNREAD_CHECKS = 1.0, 5
 _HANGS_S = 0.5
 """After so long a handshake is doubted: the place is probed, and again each time so much later."""
 _PROBE_S = 3.0
@@ -60,14 +64,19 @@ def connections(table: Path, *, inodes: Container[str] | None = None) -> Iterato
 
 def listening_ends() -> set[str]:
     """Where sockets of this process listen or take datagrams."""
-    own, found = own_sockets(), set()
-    for table in (*TCP_TABLES, *UDP_TABLES):
+    listening = {end for end, state, _ in _own(TCP_TABLES) if state == _LISTENING}
+    return listening | {end for end, *_ in _own(UDP_TABLES)}
+
+
+def _own(tables: Iterable[Path]) -> Iterator[tuple[str, str, int]]:
+    # End, state and unread bytes of each socket of this process.
+    own = own_sockets()
+    for table in tables:
         with suppress(OSError):  # a kernel without IPv6
             for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                _, ours, _, state, *_, inode = line.split(maxsplit=10)[:10]
-                if int(inode) in own and (state == _LISTENING or table in UDP_TABLES):
-                    found.add(_end(ours))
-    return found
+                _, ours, _, state, queues, *_, inode = line.split(maxsplit=10)[:10]
+                if int(inode) in own:
+                    yield _end(ours), state, int(queues.partition(":")[2], 16)
 
 
 def ends_of(end: str) -> set[str]:
@@ -98,6 +107,9 @@ class StaleSockets:
     one has its full time, should the other side be slow. Of a name with several addresses the first, where
     it is dark, would take all of ``open_timeout`` each time: it is shut down as soon as another one answers.
 
+    A UDP listener that is not read any more is said: Zenoh's stands still for ever where two datagrams wait from a
+    link that ended while the program was stopped.
+
     Other sockets of the process are none of its business, even where they are connected to the same place: Zenoh's
     have the send buffer that its configuration says. What is a link of any session here is no handshake.
     """
@@ -124,6 +136,11 @@ class StaleSockets:
         self._same_name: dict[str, list[str]] = {}
         """The other addresses of a name, of a place that was probed."""
         self._spare_until_s = 0.0
+        listen = re.findall(r'"(?:udp|quic)/[^"]*?:(\d+)["?#]', config.get_json("listen/endpoints"))
+        self._datagram_ports = set(listen)
+        self._unread: dict[str, tuple[int, int]] = {}
+        """What waits at a UDP listener, and for how many checks it has not become less."""
+        self._next_unread_s = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-sockets", daemon=True)
 
@@ -150,6 +167,9 @@ class StaleSockets:
                 self._check(time.monotonic())
 
     def _check(self, now_s: float) -> None:
+        if self._datagram_ports and now_s >= self._next_unread_s:
+            self._next_unread_s = now_s + _UNREAD_EVERY_S
+            self.check_unread()
         own = self._zenohs()
         self._done = {inode for inode, fd in own.items() if inode in self._done or _linger_ended(fd, inode)}
         if not self._ports:
@@ -178,6 +198,22 @@ class StaleSockets:
             dark += stale
         for inode in dark:
             _shut_down(own[inode], inode)
+
+    def check_unread(self) -> None:
+        """Say once of a UDP listener that it is not read; call it about once a second."""
+        before, self._unread = self._unread, {}
+        for end, _, size in _own(UDP_TABLES):
+            port = end.rpartition(":")[2]
+            if size and port in self._datagram_ports:
+                least, checks = before.get(end, (0, 0))
+                self._unread[end] = (size, checks + 1 if size >= least else 1)
+                if self._unread[end][1] > _UNREAD_CHECKS:
+                    self._datagram_ports.discard(port)
+                    _log.error(
+                        "what comes to udp %s is not read any more, as may happen to a program that was stopped for "
+                        "some seconds: restart it",
+                        end,
+                    )
 
     def _zenohs(self) -> dict[int, int]:
         # Inode → descriptor. Each socket is looked at once: a host program may have thousands.

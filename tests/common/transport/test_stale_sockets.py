@@ -18,8 +18,8 @@ import json5
 import pytest
 
 from hvt_common.transport.session import open_session
-from hvt_common.transport.stale_sockets import TCP_TABLES, end_of, same_socket
-from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.transport.stale_sockets import TCP_TABLES, StaleSockets, end_of, same_socket
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 from programs.fleet_keys import Fleet
 from programs.processes import eventually
 from programs.silent_tunnel import SilentTunnel
@@ -52,6 +52,22 @@ def test_an_end_has_one_spelling() -> None:
         "tcp/[fe80::1%2]:7447#so_sndbuf=8192": "[fe80::1]:7447",
     }
     assert {locator: end_of(locator) for locator in ends} == ends
+
+
+def test_a_udp_listener_that_nobody_reads_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    """A ground that was stopped for some seconds would say for ever that the link is lost."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        host, port = deaf.getsockname()
+        config, _ = configure(LinkSettings("ground", listen=(f"udp/{host}:{port}",)))
+        watch = StaleSockets(None, config)  # type: ignore[arg-type]
+        for check in range(12):
+            for _ in range(2 * (check == 3)):  # somebody reads
+                deaf.recv(9)
+            deaf.sendto(b"one", (host, port))
+            watch.check_unread()
+            assert len(caplog.messages) == (check >= 8)
+    assert f"{host}:{port}" in caplog.messages[0]
 
 
 def test_no_socket_of_zenoh_lingers(free_port: int) -> None:
@@ -120,7 +136,7 @@ def test_a_program_that_leaves_its_session_open_ends_the_watch(free_port: int) -
 import atexit, threading
 atexit.register(lambda: print(*(one.name for one in threading.enumerate() if one.name.startswith("hvt-"))))
 from hvt_common.transport.session import open_session
-from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 left = open_session(LinkSettings("ground", listen=("tcp/127.0.0.1:{free_port}",)))
 left.__enter__()
 """
