@@ -1,4 +1,4 @@
-"""Files that people name: read whole within a bound, written whole or not at all.
+"""Files that people name: read whole within a bound, written whole or not at all, still there while they are written.
 
 A device that never ends is one that is too large to read.
 """
@@ -18,7 +18,7 @@ MOST_TABLE_BYTES = 1_000_000_000
 
 
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
-    """All of a file. Raises `OSError`, also where it is larger than ``most``."""
+    """All of a file. Raises `OSError`, also where it is larger than ``most``, as a device without an end is."""
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size or most  # that of a pipe or a device is 0
         content = file.read(min(size, most) + 1)
@@ -71,3 +71,31 @@ def _is_output(path: Path) -> bool:
         return os.path.samestat(path.stat(), os.fstat(1))
     except OSError:  # not there yet
         return False
+
+
+def check_there(file: int, path: Path) -> None:
+    """Raise `FileNotFoundError` where no name leads to the open file any more: whoever looks would not find it.
+
+    One that was moved, or whose folder was, is where the system says.
+    """
+    if os.fstat(file).st_nlink == 0:
+        raise FileNotFoundError(None, "it was removed", str(path))
+    if _is_gone(path) and _is_gone(_named_by_system(file)):
+        raise FileNotFoundError(None, "its disk was unmounted", str(path))
+
+
+def _named_by_system(file: int) -> Path:
+    try:
+        return Path(f"/proc/self/fd/{file}").readlink()
+    except OSError:  # another system than Linux
+        return Path(os.devnull)
+
+
+def _is_gone(path: Path) -> bool:
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:  # nobody may look there, which says nothing
+        return False
+    return False

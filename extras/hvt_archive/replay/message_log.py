@@ -21,12 +21,12 @@ from typing import BinaryIO
 import msgpack
 
 from hvt_common.errors import UserError, telling
+from hvt_common.files import check_there
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
 from hvt_common.runtime.statistics import Newest
 from hvt_common.transport.inbox import Received
 from hvt_ground.sinks import SinkWriter
-from hvt_ground.sinks.line_file import check_there
 
 _log = logging.getLogger(__name__)
 

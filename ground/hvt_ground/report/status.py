@@ -124,10 +124,11 @@ def completed(
     failed = [*sessions.failures.parts, *(one for one in general if _concerns(one.part, edge))]
     queued = [sink for sink in sinks if isinstance(sink, QueuedSink)]
     recordings = [path for sink in queued for path in sink.files if path.suffix == ".rrd"]
+    sizes = [path.stat().st_size for path in recordings if path.exists()]
     return content | {
         "recording": str(recordings[0]) if recordings else None,
         "recordings": [str(path) for path in recordings],
-        "recording_bytes": sum(path.stat().st_size for path in recordings if path.exists()),
+        "recording_bytes": sum(sizes) if sizes or not recordings else None,
         "missing_events": {sink.part: sink.missing for sink in queued if sink.missing},
         "unusable_messages": sessions.receiver.unusable,
         "backlog": content["backlog"] | {"recordings": [str(path) for path in sessions.backlog.paths]},
@@ -196,7 +197,9 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("latency", f"{since} to overlay: {spread}"))
     if content["recordings"]:
         files = ", ".join(content["recordings"])
-        rows.append(("recording", f"{files}, {content['recording_bytes'] / 1e6:.2f} MB"))
+        size_bytes = content["recording_bytes"]
+        size = "not there any more" if size_bytes is None else f"{size_bytes / 1e6:.2f} MB"
+        rows.append(("recording", f"{files}, {size}"))
     for one in content["failed"]:
         ends = "works again" if one["working"] else "did not work again"
         count = "once" if one["count"] == 1 else f"{one['count']} times"

@@ -10,13 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from hvt_common.errors import UserError, telling
+from hvt_common.files import check_there
 from hvt_ground.sinks.queued import SinkWriter
-
-
-def check_there(file: int, path: Path) -> None:
-    """Raise `FileNotFoundError` where the open file has been removed: what is written to it would be in none."""
-    if os.fstat(file).st_nlink == 0:
-        raise FileNotFoundError(None, "it was removed", str(path))
 
 
 def claim_name(path: Path) -> bool:
