@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import os
 import queue
 import threading
 import time
@@ -20,7 +19,8 @@ from typing import IO, Self
 import av
 import av.error
 
-from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.files import check_there
+from hvt_common.runtime.failures import Failures, RetryPause, Turns
 from hvt_common.values import AccessUnit
 
 _log = logging.getLogger(__name__)
@@ -77,9 +77,11 @@ class LocalCopy:
         self.close()
 
     def _run(self) -> None:
+        turns = Turns(_PART, self._failures)
         while (unit := self._queue.get()) is not None:
             try:
-                self._append(unit)
+                with turns:
+                    self._append(unit)
             except Exception as error:  # noqa: BLE001 - it ends the copy, never the flight
                 self._fail(error)
         try:
@@ -150,8 +152,7 @@ class _MatroskaFile:
         packet.time_base = self._time_base
         packet.is_keyframe = unit.keyframe
         self._container.mux(packet)
-        if os.fstat(self._file.fileno()).st_nlink == 0:
-            raise OSError("it was removed")
+        check_there(self._file.fileno(), self.path)
         self._count += 1
 
     def close(self) -> None:

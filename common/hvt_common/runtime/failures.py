@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 from weakref import WeakSet
 
 from hvt_common.errors import FOREIGN, NotYetError, UserError
@@ -21,7 +21,7 @@ _Answer = TypeVar("_Answer")
 _REDACTION = Redaction()
 _STEADY_NS = 60 * SECOND_NS
 """A failure after it worked for so long is news."""
-_SILENT_NS = 10 * SECOND_NS
+SILENT_NS = 10 * SECOND_NS
 """The slowest network answers sooner."""
 _STEADY_PAUSES = 10
 """What has worked for so many first pauses is tried again after the first one: that costs little."""
@@ -70,9 +70,9 @@ class Failures:
         self._parts: dict[str, Failure] = {}
         self._said: set[str] = set()
         """Parts that the log has reported as failed."""
-        self._watched = WeakSet[Retried[Any]]()
+        self._watched = WeakSet[Turns]()
 
-    def watch(self, part: Retried[Any]) -> None:
+    def watch(self, part: Turns) -> None:
         """Ask it before each look at what fails now whether it hangs, for as long as it is there."""
         with self._lock:
             self._watched.add(part)
@@ -153,10 +153,65 @@ class RetryPause:
         return now_ns - self._failed_ns >= self.pause_ns
 
 
-class Retried(Generic[_Part]):
-    """A part that may raise whatever it likes: it is opened again after a pause. Threads take turns.
+class _InHand(threading.local):
+    turns: Turns | None = None
 
-    One that hangs, as a driver may, is waited for, and has failed until it answers.
+
+_in_hand = _InHand()
+
+
+class Turns:
+    """The turns of a part that may hang, as a driver or a disk does: it has failed until it answers.
+
+    Of two turns in one another only the inner one is watched. For one thread, or threads that take turns.
+    """
+
+    def __init__(
+        self, name: str, failures: Failures, *, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._name, self._failures, self._clock = name, failures, clock
+        self.count = 0
+        """Begun and ended, or left for an inner one: odd while it is asked."""
+        self._seen = 0, 0
+        """As many at a former `check`, and when."""
+        self._hangs = False
+        self._outer: Turns | None = None
+        failures.watch(self)
+
+    def __enter__(self) -> None:
+        self._outer, _in_hand.turns = _in_hand.turns, self
+        if self._outer is not None:
+            self._outer.count += 1
+        self.count += 1
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.count += 1
+        if self._outer is not None:
+            self._outer.count += 1
+        _in_hand.turns, self._outer = self._outer, None
+        if self._hangs:
+            self._hangs = False
+            if kind is None:
+                self._failures.works(self._name)
+
+    def check(self) -> None:
+        """Say that it hangs, where it does."""
+        count, now_ns = self.count, self._clock()
+        if count != self._seen[0]:
+            self._seen = count, now_ns
+        elif count % 2 and not self._hangs and now_ns - self._seen[1] > SILENT_NS:
+            self._hangs = True
+            self._failures.failed(self._name, f"no answer for {SILENT_NS // SECOND_NS} s")
+
+    @staticmethod
+    def goes_on() -> None:
+        """The turn that this thread has in hand takes long by its nature, and does not hang."""
+        if _in_hand.turns is not None:
+            _in_hand.turns.count += 2
+
+
+class Retried(Generic[_Part]):
+    """A part that may raise whatever it likes: it is opened again after a pause. Threads take turns (`Turns`).
 
     ``failures`` has it under ``name``; ``clock`` is nanoseconds without steps. Raises what ``open_part`` does.
     """
@@ -176,22 +231,9 @@ class Retried(Generic[_Part]):
         self._failures = failures
         self._clock = clock
         self._pause = RetryPause()
-        self._failed = self._hangs = False
-        self._turns = 0
-        """Begun and ended: odd while it is asked."""
-        self._seen = 0, 0
-        """As many at a former `check`, and when."""
+        self._failed = False
+        self._turns = Turns(name, failures, clock=clock)
         self._lock = threading.Lock()
-        failures.watch(self)
-
-    def check(self) -> None:
-        """Say that it hangs, where it does."""
-        turns, now_ns = self._turns, self._clock()
-        if turns != self._seen[0]:
-            self._seen = turns, now_ns
-        elif turns % 2 and not self._hangs and now_ns - self._seen[1] > _SILENT_NS:
-            self._hangs = True
-            self._failures.failed(self._name, f"no answer for {_SILENT_NS // SECOND_NS} s")
 
     def run(self, use: Callable[[_Part], _Answer]) -> _Answer | None:
         """None where it fails, or has failed and is left alone for a while."""
@@ -201,17 +243,15 @@ class Retried(Generic[_Part]):
             try:
                 if self._failed:
                     self.part = self._open_part()
-                self._turns += 1
-                answer = use(self.part)
+                with self._turns:
+                    answer = use(self.part)
             except FOREIGN as error:
                 self._pause.failed(self._clock(), again=self._failed)
                 self._failed = True
                 self._failures.failed(self._name, reason_of(error))
                 return None
-            finally:
-                self._turns += self._turns % 2
-            if self._failed or self._hangs:
-                self._failed = self._hangs = False
+            if self._failed:
+                self._failed = False
                 self._failures.works(self._name)
             return answer
 

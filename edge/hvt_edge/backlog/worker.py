@@ -25,7 +25,7 @@ from hvt_common.protocol.messages import (
     ObjectKey,
     pack_backlog_still,
 )
-from hvt_common.runtime.failures import Failures, RetryPause, reason_of
+from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
 from hvt_common.runtime.process import lower_priority
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
@@ -321,10 +321,13 @@ class StoreWorker:
 
     def _run(self) -> None:
         lower_priority()
+        turns = Turns(_PART, self._failures, clock=self._clock)
         try:
-            self._attempt(self._store.enter)
+            with turns:
+                self._attempt(self._store.enter)
             while not self.intake.ended:
-                self._turn()
+                with turns:
+                    self._turn()
             self._attempt(self._store.close)
         except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
             self._error = error

@@ -15,7 +15,7 @@ from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.errors import FOREIGN
 from hvt_common.protocol.messages import StillResult
-from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.runtime.failures import Failures, RetryPause, Turns
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.perception.shadow import Detected
@@ -140,23 +140,27 @@ class StillWorker:
 
     def _run(self) -> None:
         lower_priority()
+        turns = Turns(_PART, self.failures, clock=self.clock)
         while not self._given_up.is_set():
             try:
                 if (item := self._next()) is None:
                     return
-                self.stage.analyzer.cpu_budget.queued = self._frames.qsize()
-                self.stage.on_results(self.results(), detected=self.detected())
-                analyzed = self.stage.analyze(*item)
-                self.stage.step(analyzed, now_ns=self.clock())
+                with turns:
+                    self.stage.analyzer.cpu_budget.queued = self._frames.qsize()
+                    self.stage.on_results(self.results(), detected=self.detected())
+                    analyzed = self.stage.analyze(*item)
+                    self.stage.step(analyzed, now_ns=self.clock())
                 self.failures.works(_PART)
             except FOREIGN as error:  # it ends stills for a while, never the flight
                 self._fail(error)
 
     def _run_requested(self) -> None:
+        turns = Turns(_REQUESTED_PART, self.failures, clock=self.clock)
         while not self._given_up.wait(_RETRY_S):
             try:
                 if self.stage.outbox.on_demand is not None:
-                    self.stage.send_requested(now_ns=self.clock())
+                    with turns:
+                        self.stage.send_requested(now_ns=self.clock())
                     self.failures.works(_REQUESTED_PART)
             except FOREIGN as error:  # it ends one requested still, never the flight
                 _log.debug("a requested still failed", exc_info=error)

@@ -184,7 +184,10 @@ class RecordingsFolder(Service):
 
     def begin(self, client: EdgeClient | None = None) -> None:  # noqa: ARG002 - no edge is asked
         self._sink = QueuedSink(
-            "recordings index", lambda: IndexWriter(self._folder, self._retention), failures=self._failures
+            "recordings index",
+            lambda: IndexWriter(self._folder, self._retention),
+            failures=self._failures,
+            unhurried=True,
         )
         self._clock.start()
 

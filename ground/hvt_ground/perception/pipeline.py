@@ -6,6 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import wait
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -92,6 +93,8 @@ class PipelineParts:
     """None where the detector's scores are no probabilities."""
     search: ScaleSearch | None = None
     """Of the detector, in this session's video; None where its scale is given."""
+    turns: AbstractContextManager[None] = field(default_factory=nullcontext)
+    """Around what is analyzed and read: it may hang."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +217,9 @@ class Pipeline:
         `take_late`, takes that in as if it had been known at once. Without, as in lockstep, it is waited for.
         """
         index = picture.frame_index
-        self._history.add_frame(index, picture.picture)
-        own = self._own = self._track(picture, hurry=hurry, news=news)
+        with self._parts.turns:
+            self._history.add_frame(index, picture.picture)
+            own = self._own = self._track(picture, hurry=hurry, news=news)
         self._picture_ns = picture.capture_ns
         ahead = self._now.frame_index > index
         shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
@@ -271,7 +275,8 @@ class Pipeline:
 
     def read(self, stills: Sequence[ReceivedStill]) -> None:
         """Take stills, in the order in which they came; those of one frame are looked at together."""
-        self._stills.take(stills, self._now)
+        with self._parts.turns:
+            self._stills.take(stills, self._now)
         self._tell()
         self._carry_merges()
 

@@ -18,6 +18,7 @@ from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import searches_scale
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import Info
+from hvt_common.runtime.failures import Turns
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Image
@@ -76,6 +77,7 @@ class SessionPerception:
             trust=self._trust,
             guesses=self._guesses(),
             search=self._scale_search(detector),
+            turns=Turns(f"perception of {info.edge}", models.failures),
         )
         return Pipeline(
             parts,

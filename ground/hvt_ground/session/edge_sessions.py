@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Self
 
@@ -25,7 +26,7 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import Failures, RetryPause, reason_of
+from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
 from hvt_common.runtime.log import log_fields
 from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS
@@ -100,6 +101,7 @@ class EdgeSessions:
         """The one that is open."""
         self.ended = 0
         self._part, self._video = f"session of {port.edge}", f"video of {port.edge}"
+        self._turns = Turns(self._video, self.failures)
         self._unseen_failure = 0
         self.error: BaseException | None = None
         self._stopped_ns: int | None = None
@@ -308,7 +310,9 @@ class EdgeSessions:
         if arrival.lost_before:
             lost = "1 picture was" if arrival.lost_before == 1 else f"{arrival.lost_before} pictures were"
             session.note("warning", f"{lost} lost: the ground waits for a keyframe")
-        if not session.base(arrival):
+        with nullcontext() if session.lockstep else self._turns:  # where others may be waited for
+            decoded = session.base(arrival)
+        if not decoded:
             self.receiver.stream.decoder_failed()
 
     def _goes_on(self, header: BaseHeader) -> bool:

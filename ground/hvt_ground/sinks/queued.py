@@ -11,12 +11,12 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from hvt_common.errors import FOREIGN
-from hvt_common.runtime.failures import Failures, RetryPause, reason_of
+from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Overlay, Refinement, VideoSample
@@ -70,8 +70,8 @@ class QueuedSink(Generic[T]):
 
     A sink that raises is closed and made anew after pauses that grow up to ``longest_pause_s``; until then what comes
     is counted as lost. Where the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as
-    dropped. ``failures`` learns of it under the name ``part``. ``for_backlog``: what was stored at the edge is to be
-    written there.
+    dropped. ``failures`` learns of it under the name ``part``, and that it hangs unless it is ``unhurried``.
+    ``for_backlog``: what was stored at the edge is to be written there.
     """
 
     def __init__(
@@ -83,6 +83,7 @@ class QueuedSink(Generic[T]):
         wait_s: float = 0.0,
         for_backlog: bool = False,
         longest_pause_s: float = 60.0,
+        unhurried: bool = False,
     ) -> None:
         self.part = part
         self.for_backlog = for_backlog
@@ -100,6 +101,7 @@ class QueuedSink(Generic[T]):
         self._ending = False
         self._hurry = threading.Event()
         self._failures = failures
+        self._turns = nullcontext() if unhurried else Turns(part, failures)
         self._failed = 0
         """Times that the part has failed, at the newest failure here."""
         longest_ns = round(longest_pause_s * SECOND_NS)
@@ -217,14 +219,16 @@ class QueuedSink(Generic[T]):
         # Make the sink and write until the end; False where that failed.
         sink: SinkWriter[T] | None = None
         try:
-            sink = open_sink()
+            with self._turns:
+                sink = open_sink()
             self._begin(sink)
             while (taken := self._take()) is not None:
                 item, skipped = taken
-                if skipped:
-                    sink.skipped(skipped)
-                    self._resumed = True
-                sink.log(item)
+                with self._turns:
+                    if skipped:
+                        sink.skipped(skipped)
+                        self._resumed = True
+                    sink.log(item)
                 self._resumed |= sink.awaits_keyframe
                 sink.awaits_keyframe = False
                 if sink.path is not None and sink.path != self.files[-1]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
-from hvt_common.runtime.failures import Failures, Retried, RetryPause
+from hvt_common.runtime.failures import Failures, Retried, RetryPause, Turns
 from hvt_common.units import SECOND_NS
 from rigs.examples import Clock
 
@@ -97,6 +97,27 @@ def test_a_part_that_exits_fails_like_one_that_raises():
     failures = Failures(time.time_ns)
     assert Retried(lambda: None, "detector", failures).run(lambda _part: sys.exit(3)) is None
     assert [one.reason for one in failures.now] == ["SystemExit: 3"]
+
+
+def test_of_parts_that_hang_in_one_another_the_inner_one_is_said():
+    """A ground whose detector hangs would call its perception broken; one that writes a footer its recording."""
+    clock = Clock(0)
+    failures = Failures(clock)
+    outer, inner = Turns("perception", failures, clock=clock), Turns("detector", failures, clock=clock)
+
+    def failing() -> list[str]:
+        clock.now_ns += 11 * SECOND_NS
+        return [one.part for one in failures.now]
+
+    with outer:
+        with inner:
+            assert failing() == []
+            assert failing() == ["detector"]
+        for _ in range(3):
+            outer.goes_on()
+            assert failing() == []
+        assert failing() == ["perception"]
+    assert not failures.now
 
 
 def test_a_part_that_hangs_is_said_until_it_answers(caplog):

@@ -87,12 +87,19 @@ def test_a_disk_that_hangs_costs_what_waits_and_says_so(tmp_path, caplog):
         disk.wait(60)
         return INFO.pack()
 
-    worker = worker_of(tmp_path / "store", Link(), info=slow, close_s=0.3)
+    link = Link()
+    worker = worker_of(tmp_path / "store", link, info=slow, close_s=0.3)
     taken = sum(worker.offer(UNIT) for _ in range(600))
     assert 512 <= taken <= 513
     with caplog.at_level(logging.WARNING):
         worker.close()
     assert f"{taken - 1} frames and stills" in caplog.text, "one is being written"
+
+    def failing() -> list[str]:
+        link.now_ns += 11 * S
+        return [one.part for one in link.failures.now]
+
+    eventually(lambda: failing() == ["store"], what="it is said that it hangs")
     disk.set()
     eventually(lambda: not len(worker.intake), what="the thread has gone on")
 

@@ -232,9 +232,14 @@ def requested_beside(rig: Rig, blocking: Blocking) -> None:
     on_demand = rig.stage.chooser.on_demand
     assert on_demand is not None
     now_ns = FRAMES[0].capture_ns
-    worker = StillWorker(
-        rig.stage, results=list, failures=Failures(time.time_ns), clock=lambda: now_ns, finish_s=PATIENT_S
-    )
+    failures = Failures(time.time_ns)
+    worker = StillWorker(rig.stage, results=list, failures=failures, clock=lambda: now_ns, finish_s=PATIENT_S)
+
+    def failing() -> list[str]:
+        nonlocal now_ns
+        now_ns += 11 * SECOND_NS
+        return [one.part for one in failures.now]
+
     try:
         for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
             eventually(lambda: worker.queued < 2 or blocking.began.is_set(), what="it is not hurried")
@@ -248,6 +253,7 @@ def requested_beside(rig: Rig, blocking: Blocking) -> None:
         assert frame_index == FRAMES[-1].index, "what the camera sees now, which nobody has analyzed"
         eventually(lambda: len(rig.out.stills) > before, what="the requested still is there")
         assert not blocking.released.is_set()
+        eventually(lambda: failing() == ["stills"], what="it is said that they hang")
         assert rig.out.stills[-1][0].reason == "asked"
     finally:
         blocking.released.set()

@@ -11,6 +11,7 @@ from contextlib import suppress
 import pytest
 
 from hvt_common.errors import UserError
+from hvt_common.runtime import failures as failures_module
 from hvt_common.runtime.failures import Failures
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.sinks import Outputs, QueuedSink
@@ -47,6 +48,21 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):
     assert sink.join(time.monotonic() + 60)
     assert lines == ["a", *["x" * 100] * 4096], "what was taken is written, in whole lines"
     assert failures.parts == (), "slow is not broken"
+
+
+def test_a_disk_that_hangs_is_said_until_it_answers(tmp_path, monkeypatch):
+    """A recording's disk hung for a minute: the queue filled, and status, page and report called all well."""
+    monkeypatch.setattr(failures_module, "SILENT_NS", 0)
+    pipe = tmp_path / "table.csv"
+    os.mkfifo(pipe)
+    failures = Failures(time.time_ns)
+    sink = QueuedSink("tracks table", lambda: LineFile(pipe, ("a",)), failures=failures)
+    eventually(lambda: [one.part for one in failures.now] == ["tracks table"], what="it is said")
+    with pipe.open() as reader:
+        sink.close()
+        assert reader.read() == "a\n"
+    assert sink.join(time.monotonic() + 60)
+    assert not failures.now
 
 
 def test_one_that_has_ended_does_not_fail_any_more():

@@ -30,7 +30,9 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError, telling
-from hvt_ground.sinks.line_file import check_there, has_nothing
+from hvt_common.files import check_there
+from hvt_common.runtime.failures import Turns
+from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 _log = logging.getLogger(__name__)
@@ -128,6 +130,7 @@ class RrdFile:
                     return
                 recording.send_chunks([chunk])
                 recording.flush(timeout_sec=_FLUSH_S)  # or all would be in memory
+                Turns.goes_on()
             recording.disconnect()
             scratch.replace(self.path)
             self.size_bytes = self.path.stat().st_size
