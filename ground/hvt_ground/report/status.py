@@ -123,7 +123,10 @@ def completed(
     general = () if failures is None else failures.parts
     failed = [*sessions.failures.parts, *(one for one in general if _concerns(one.part, edge))]
     queued = [sink for sink in sinks if isinstance(sink, QueuedSink)]
-    recordings = [path for sink in queued for path in sink.files if path.suffix == ".rrd"]
+    files = dict.fromkeys(
+        path for sink in queued for path in sink.files
+    )  # one that was removed may come again
+    recordings = [path for path in files if path.suffix == ".rrd"]
     sizes = [path.stat().st_size for path in recordings if path.exists()]
     return content | {
         "recording": str(recordings[0]) if recordings else None,

@@ -224,9 +224,10 @@ def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     eventually(lambda: "second recording of uav-1 FAILED at " in ground.line(), what="it failed")
     ground.sessions.close()
     ground.outputs.close()
-    content = completed(
-        summary(ground.ended[0]), ground.sessions, sinks=ground.ended[0].sinks, failures=ground.failures
-    )
+    sinks = ground.ended[0].sinks
+    for one in sinks:
+        one.files *= 2  # removed in flight, it began anew under its name
+    content = completed(summary(ground.ended[0]), ground.sessions, sinks=sinks, failures=ground.failures)
     assert content["recordings"] == [str(ground.path)]
     assert content["recording_bytes"] == ground.path.stat().st_size
     (failed,) = content["failed"]
@@ -239,6 +240,9 @@ def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     rows = [text for name, text in table(content) if name in ("failed", "missing")]
     assert any("second recording of uav-1" in row and "did not work again" in row for row in rows)
     assert any("events in second recording of uav-1" in row for row in rows)
+    ground.path.unlink()
+    content = completed(summary(ground.ended[0]), ground.sessions, sinks=sinks)
+    assert dict(table(content))["recording"] == f"{ground.path}, not there any more", "it said 0.00 MB"
     absurd = Failures(lambda: 2**90)
     absurd.failed("timing table", "gone")
     failed = completed(summary(ground.ended[0]), ground.sessions, failures=absurd)["failed"]
