@@ -27,6 +27,9 @@ _MAY_COME = frozenset(
 )
 _INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_NO_MORE = (errno.ENOMEM, errno.EMFILE, errno.ENFILE)
+_NO_MORE_WORDS = ("can't start new thread", "failed to map segment from shared object")
+"""Of Python's errors without a number."""
 FOREIGN = (Exception, SystemExit)
 """What code of others raises: much of it calls `sys.exit` where something is wrong."""
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
@@ -159,8 +162,8 @@ def exit_with_sentence(
     130, as of a shell, where the user has interrupted it. Neither that nor a traceback has the secrets of an address
     in ``argv``.
 
-    Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word; a full disk
-    with 1. Standard streams that were closed are /dev/null.
+    Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word; a full disk,
+    or no memory, with 1. Standard streams that were closed are /dev/null.
     """
     _open_standard_streams()
     redaction = Redaction(sys.argv[1:] if argv is None else argv)
@@ -180,16 +183,29 @@ def exit_with_sentence(
         if not _reader_left():
             raise
         return 1
-    except OSError as error:
-        if error.errno not in _FULL:
+    except Exception as error:
+        sentence = _used_up(error)
+        if not sentence:
             raise
-        _discard_output()
-        print(
-            f"{program}: a disk that it writes to is full ({error.strerror}): make room there",
-            file=sys.stderr,
-        )
+        if isinstance(error, OSError) and error.errno in _FULL:
+            _discard_output()
+        print(f"{program}: {sentence}", file=sys.stderr)
         return 1
     return code
+
+
+def _used_up(error: Exception) -> str:
+    # What the machine has no more of; empty where that is not the reason.
+    number = error.errno if isinstance(error, OSError) else None
+    reason = str(getattr(error, "strerror", None) or error) or type(error).__name__
+    if number in _FULL:
+        return f"a disk that it writes to is full ({reason}): make room there"
+    if isinstance(error, MemoryError) or number in _NO_MORE or any(one in reason for one in _NO_MORE_WORDS):
+        return (
+            f"the system gives it no more memory, threads or files ({reason}): "
+            "end other programs, or raise what ulimit -a shows"
+        )
+    return ""
 
 
 def _open_standard_streams() -> None:

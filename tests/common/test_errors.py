@@ -147,6 +147,26 @@ def test_output_for_which_there_is_no_room_is_a_sentence(tmp_path):
     assert done.stderr.splitlines() == ["said", says]
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("can't start new thread"),
+        OSError(errno.EMFILE, "Too many open files"),
+        ImportError("/lib/zenoh.so: failed to map segment from shared object"),
+    ],
+)
+def test_where_the_system_gives_no_more_that_is_a_sentence(error, capsys):
+    """A start under `ulimit -v`, `-u` or `-n` ended in a traceback."""
+
+    def run(_argv):
+        raise error
+
+    assert exit_with_sentence(run, program="it", argv=[]) == 1
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("it: the system gives it no more memory, threads or files (")
+
+
 def test_an_interruption_is_a_sentence(capsys):
     """Ctrl-C while a ground starts, or in the middle of an export, showed forty lines of a traceback."""
 
