@@ -23,7 +23,10 @@ from hvt_ground.sinks.palette import class_colour
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
 """libavformat's names of the containers."""
 _TIME_BASE = Fraction(1, 1000)
+_LONGEST = 2**31
 """MP4 has 32 bits for the time between two pictures: 24 days."""
+_SET_BACK = 1000
+"""A picture so much before the last one is of a clock that was set."""
 _CRF = "20"
 
 
@@ -64,20 +67,20 @@ def _copy(samples: Sequence[VideoSample], output: OutputContainer, container: st
         # Apple's players take no other; it has parameter sets once for all, so that they must not change.
         stream.codec_context.codec_tag = "hvc1"
     stream.time_base = _TIME_BASE
-    for sample, at in _timed(samples):
+    times = _Times(samples[0].capture_ns)
+    for sample in samples:
         packet = av.Packet(sample.data)
         packet.stream, packet.time_base = stream, _TIME_BASE
-        packet.pts = packet.dts = at
+        packet.pts = packet.dts = times.next(sample.capture_ns)
         packet.is_keyframe = sample.keyframe
         output.mux(packet)
 
 
 def _draw(recorded: Recorded, output: OutputContainer) -> None:
     stream = None
-    first_ns, last = 0, -1
+    times = _Times(recorded.decodable_video()[0].capture_ns)
     for sample, picture, overlay in pictures(recorded):
         if stream is None:
-            first_ns = sample.capture_ns
             stream = output.add_stream("libx264", options={"crf": _CRF, "preset": "veryfast"})
             stream.height, stream.width = (side - side % 2 for side in picture.shape[:2])
             stream.pix_fmt = "yuv420p"
@@ -86,8 +89,7 @@ def _draw(recorded: Recorded, output: OutputContainer) -> None:
         frame = av.VideoFrame.from_ndarray(
             np.ascontiguousarray(drawn[: stream.height, : stream.width]), "bgr24"
         )
-        last = max(last + 1, _since(sample.capture_ns, first_ns))
-        frame.pts, frame.time_base = last, _TIME_BASE
+        frame.pts, frame.time_base = times.next(sample.capture_ns), _TIME_BASE
         output.mux(stream.encode(frame))
     if stream is not None:
         output.mux(stream.encode())
@@ -108,13 +110,20 @@ def _with_boxes(picture: Image, overlay: Overlay) -> Image:
     return drawn
 
 
-def _timed(samples: Sequence[VideoSample]) -> Iterator[tuple[VideoSample, int]]:
-    """With the time of each in `_TIME_BASE`, which grows."""
-    last, first_ns = -1, samples[0].capture_ns
-    for sample in samples:
-        last = max(last + 1, _since(sample.capture_ns, first_ns))
-        yield sample, last
+class _Times:
+    # Of the pictures in `_TIME_BASE`, which grow. After a clock that was set the next one is a frame later: until it
+    # had caught up an hour's pictures would pass in seconds.
 
+    def __init__(self, first_ns: int) -> None:
+        self._zero_ns, self._last, self._between = first_ns, -1, 1
 
-def _since(capture_ns: int, first_ns: int) -> int:
-    return round(Fraction(capture_ns - first_ns, SECOND_NS) / _TIME_BASE)
+    def next(self, capture_ns: int) -> int:
+        at = round(Fraction(capture_ns - self._zero_ns, SECOND_NS) / _TIME_BASE)
+        if self._last - _SET_BACK < at < self._last + _LONGEST:
+            at = max(self._last + 1, at)
+            self._between = at - self._last
+        else:
+            at = self._last + self._between
+            self._zero_ns = capture_ns - int(at * _TIME_BASE * SECOND_NS)
+        self._last = at
+        return at

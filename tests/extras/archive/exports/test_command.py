@@ -118,6 +118,19 @@ def test_an_mp4_is_what_apple_plays_where_that_can_be(tmp_path, sizes, tag):
         assert sum(1 for _ in video.decode(video=0)) == len(units)
 
 
+@pytest.mark.parametrize("options", [(), ("--burn-in",)])
+def test_a_clock_that_was_set_leaves_a_video_its_pace(tmp_path, options):
+    """Set back by an hour, an hour's pictures passed in seconds; set on by a year, it was no MP4."""
+    path = tmp_path / "flight.rrd"
+    with Recorder(settings(path)) as recorder:
+        for index, (unit, _) in enumerate(coded(drawn_frames(21, SIZE), kbps=300, keyint=21)):
+            moved_ns = (0, -3_600 * 10**9, 400 * 86_400 * 10**9)[index // 7]
+            recorder.log(VideoSample(index, START_NS + index * STEP_NS + moved_ns, unit, keyframe=index == 0))
+    with av.open(str(export(path, tmp_path / "flight.mp4", *options))) as video:
+        times = [one.time for one in video.decode(video=0)]
+    assert np.allclose(np.diff(times), STEP_NS / 1e9, atol=0.002)
+
+
 def test_boxes_are_drawn_in_on_request(recording, events, tmp_path):
     """Whoever gets the file has no viewer that lays boxes over it."""
     out = export(recording, tmp_path / "flight.mp4", "--burn-in")
