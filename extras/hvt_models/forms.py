@@ -99,7 +99,8 @@ class PerQuery:
         """Score is the best class score."""
         boxes, table = rows_of(outputs[0]), rows_of(outputs[1])
         if self.logits:
-            table = np.asarray(1 / (1 + np.exp(-np.clip(table, -30, 30))), np.float32)
+            sure = 1 / (1 + np.exp(-np.clip(table, -30, 30)))
+            table = np.where(table == np.inf, table, sure).astype(np.float32)
         picked = np.flatnonzero(table.max(axis=1, initial=0) >= confidence)
         scores, class_ids = best(table[picked], None)
         pixels = _pixels(corners(boxes[picked], self.form), input_size)

@@ -48,9 +48,12 @@ def suppress(
     span = float(np.abs(boxes_xyxy).max()) * 2 + 1
     apart = rects.copy()
     apart[:, :2] += class_ids[best, None] * span
-    selected = _greedy(apart, iou)
-    if any_class_iou < 1:
-        selected = selected[_greedy(rects[selected], any_class_iou)]
+    count, selected = 0, np.empty(0, np.intp)
+    while len(selected) < limit and count < len(best):  # no box changes what better ones become
+        count = 2 * max(count, limit)
+        selected = _greedy(apart[:count], iou)
+        if any_class_iou < 1:
+            selected = selected[_greedy(rects[selected], any_class_iou)]
     return best[selected[:limit]]
 
 
