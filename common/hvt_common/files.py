@@ -8,6 +8,7 @@ from __future__ import annotations
 import codecs
 import errno
 import os
+import select
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -15,16 +16,30 @@ from pathlib import Path
 MOST_BYTES = 16_000_000
 MOST_TABLE_BYTES = 1_000_000_000
 """Of labels and annotations of a whole dataset."""
+PIPE_WAIT_S = 10.0
+"""A pipe into which nobody writes for so long is read no further: no signal ends such a wait."""
 
 
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
-    """All of a file. Raises `OSError`, also where it is larger than ``most``, as a device without an end is."""
-    with path.open("rb") as file:
+    """All of a file. Raises `OSError`, also where it is larger than ``most``, or a pipe that nobody writes into."""
+    with open(path, "rb", opener=_open_at_once, buffering=0) as file:  # noqa: PTH123 - a Path takes no opener
         size = os.fstat(file.fileno()).st_size or most  # that of a pipe or a device is 0
-        content = file.read(min(size, most) + 1)
+        news = select.poll()
+        news.register(file, select.POLLIN)
+        content = b""
+        while left := min(size, most) + 1 - len(content):
+            if not news.poll(PIPE_WAIT_S * 1000):
+                raise OSError(errno.ETIMEDOUT, f"a pipe into which nobody writes for {PIPE_WAIT_S:g} s")
+            if not (more := file.read(left)):
+                break
+            content += more
     if len(content) > most:
         raise OSError(errno.EFBIG, f"larger than {most / 1e6:g} MB")
     return content
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)  # else a pipe is opened when somebody opens its other end
 
 
 def read_text(path: Path, *, most: int = MOST_BYTES) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from hvt_common import files
 from hvt_common.config import load
 from hvt_common.errors import NotYetError, Parser, UserError, exit_with_sentence, may_come, named_path
 from hvt_common.files import read_text
@@ -77,6 +79,23 @@ def test_a_file_without_an_end_is_refused(read):
     with pytest.raises((OSError, UserError)) as raised:
         read(ENDLESS)
     assert "larger than 16 MB" in str(raised.value) or "not a file" in str(raised.value)
+
+
+def test_a_pipe_that_nobody_writes_into_is_read_no_further(monkeypatch, tmp_path):
+    """The start stood still, and neither Ctrl-C nor a service manager ended it but by force."""
+    monkeypatch.setattr(files, "PIPE_WAIT_S", 0.0)
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(OSError, match="into which nobody writes"):
+        read_text(pipe)
+
+
+def test_a_pipe_is_read_to_its_end():
+    """``--config <(…)`` brings settings that no disk shall hold."""
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "wb") as writer:
+        writer.write(b"edge-id")
+    assert read_text(Path(f"/proc/self/fd/{reading}")) == "edge-id"
+    os.close(reading)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
