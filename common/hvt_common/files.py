@@ -10,6 +10,7 @@ import errno
 import os
 import select
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,12 +18,12 @@ MOST_BYTES = 16_000_000
 MOST_TABLE_BYTES = 1_000_000_000
 """Of labels and annotations of a whole dataset."""
 PIPE_WAIT_S = 10.0
-"""A pipe into which nobody writes for so long is read no further: no signal ends such a wait."""
+"""So long a pipe's other end is waited for, and what comes through it."""
 
 
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
     """All of a file. Raises `OSError`, also where it is larger than ``most``, or a pipe that nobody writes into."""
-    with open(path, "rb", opener=_open_at_once, buffering=0) as file:  # noqa: PTH123 - a Path takes no opener
+    with open(path, "rb", opener=at_once, buffering=0) as file:
         size = os.fstat(file.fileno()).st_size or most  # that of a pipe or a device is 0
         news = select.poll()
         news.register(file, select.POLLIN)
@@ -38,8 +39,22 @@ def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
     return content
 
 
-def _open_at_once(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)  # else a pipe is opened when somebody opens its other end
+def at_once(path: str, flags: int) -> int:
+    """For `open` as ``opener``: to write into a pipe that nobody reads is an `OSError` after a while.
+
+    No signal ends the system's own wait for the other end.
+    """
+    end_s = time.monotonic() + PIPE_WAIT_S
+    while True:
+        try:
+            opened = os.open(path, flags | os.O_NONBLOCK, 0o666)
+        except OSError as error:
+            if error.errno != errno.ENXIO or time.monotonic() >= end_s:
+                raise
+            time.sleep(0.05)
+        else:
+            os.set_blocking(opened, True)
+            return opened
 
 
 def read_text(path: Path, *, most: int = MOST_BYTES) -> str:
@@ -68,7 +83,8 @@ def write_whole(path: Path, content: bytes) -> None:
             output.write(content)
         return
     if path.exists() and not path.is_file():
-        path.write_bytes(content)
+        with open(path, "wb", opener=at_once) as output:
+            output.write(content)
         return
     real = Path(os.path.realpath(path))
     scratch = real.with_name(f"{real.name}.{os.getpid()}.part")

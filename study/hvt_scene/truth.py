@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.files import at_once
 from hvt_common.units import exact_rate
 from hvt_common.values import Boxes, View
 
@@ -89,5 +90,6 @@ def write_truth(scene: TruthSource, path: Path, *, fps: float, view: View) -> in
                 lines.append(
                     f"{index + 1},{number},{x:.2f},{y:.2f},{w:.2f},{h:.2f},1,{kind + 1},{share:.3f}\n"
                 )
-    path.write_text("".join(lines), encoding="ascii")
+    with open(path, "w", encoding="ascii", opener=at_once) as file:
+        file.writelines(lines)
     return len(lines)

@@ -112,7 +112,7 @@ def say(text: str) -> None:
 def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     table = Table(title=Text(title), show_header=False, title_justify="left", title_style="bold")
     table.add_column(style="cyan", no_wrap=True)
-    table.add_column()
+    table.add_column(overflow="fold")
     for name, value in rows:
         table.add_row(
             Text(shown_text(name)), Text(shown_text(value))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from hvt_common import files
 from hvt_common.errors import FlightError, UserError, exit_with_sentence
 from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, write_json
 
@@ -63,6 +64,14 @@ def test_a_summary_on_standard_output_stands_behind_what_was_printed(tmp_path):
     assert link.is_symlink()
 
 
+def test_a_summary_into_a_pipe_that_nobody_reads_is_a_sentence(tmp_path, monkeypatch):
+    """The program never ended, and no signal ended it but by force."""
+    monkeypatch.setattr(files, "PIPE_WAIT_S", 0.0)
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(FlightError, match=r"pipe cannot be written \(No such device or address\)"):
+        write_json(pipe, {})
+
+
 def test_files_that_cannot_be_written_are_refused_before_the_run(tmp_path):
     """The numbers of an hour's flight would be lost at its end."""
     check_writable(None, name="--summary")
@@ -92,6 +101,13 @@ def test_a_table_says_paths_and_names_as_they_are(capsys):
     assert "/data/[run 1]/[/bold]:car:.rrd" in out
     assert "uav[/]1" in out
     assert "[red]" in out
+
+
+def test_a_narrow_terminal_cuts_no_word(monkeypatch, capsys):
+    """Of ``objects`` and ``preset`` it left ``obje…`` and ``pres…``."""
+    monkeypatch.setenv("COLUMNS", "12")
+    print_table("uav-1", [("total", "123456789 bytes")])
+    assert "…" not in capsys.readouterr().out
 
 
 def test_a_log_gets_a_line_now_and_then(capsys):
