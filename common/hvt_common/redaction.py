@@ -72,11 +72,10 @@ def redacted(address: str) -> str:
     end = _SEPARATOR.search(body)
     authority, rest = (body, "") if end is None else (body[: end.start()], body[end.start() :])
     _, at, host = authority.rpartition("@")
-    if "@" in rest:  # a password with a slash, or a path with an @
-        return f"{scheme}{HIDDEN}"
     good = _HOST.fullmatch(host)
-    if good is None or int(good[2] or 0) > _MOST_PORT:
-        return f"{scheme}{HIDDEN}"
+    # An @ in the rest: a password with a slash, or a path with an @.
+    if "@" in rest or good is None or int(good[2] or 0) > _MOST_PORT:
+        return f"{scheme}{body and HIDDEN}"
     if good[2] and not at and "." not in good[1] and good[1] not in ("localhost", "") and good[1][0] != "[":
         host = f"{good[1]}:{HIDDEN}"  # admin:12345 with the host left out
     return (

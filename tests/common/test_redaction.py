@@ -162,6 +162,7 @@ def test_the_path_of_a_camera_is_shown(path):
         ("rtsps://h/SECRETabcDEF123", "rtsps://h/…"),
         ("rtsp://10.0.0.5:8554/hunter2", "rtsp://10.0.0.5:8554/…"),
         ("rtmp://a.example/live2/abcd-efgh", "rtmp://a.example/…/…"),
+        ("rtsp://", "rtsp://"),
         ("udp://239.0.0.1:5000", "udp://239.0.0.1:5000"),
         ("rtsp://admin:p#w@10.0.0.5/x", "rtsp://…"),
         ("/media/2026-01-26T20:57:04Z.mp4", "/media/2026-01-26T20:57:04Z.mp4"),
