@@ -273,7 +273,8 @@ def _metadata(spec: str, *, role: str) -> dict[str, str]:
     # The metadata of a file; the motion detector and plug-ins have none.
     if role == "detector" and (spec == MOTION or plug_in_of(spec) is not None):
         return {}
-    path = resolve_model(spec, role=role, words=(MOTION, *plug_in_names()))
+    words = (MOTION, *plug_in_names()) if role == "detector" else ()
+    path = resolve_model(spec, role=role, words=words)
     return ir_metadata(path) if is_ir(path) else onnx_metadata(path)
 
 

@@ -237,3 +237,9 @@ def test_who_has_a_detector_without_names_is_told_how_each_side_gives_them(
     """At the ground ``--labels`` names a classifier's classes: whoever did as told was refused."""
     assert detector_labels(Path("nameless.onnx"), None, "", head="", classes=1, inputs=1) == ("class 0",)
     assert "--labels FILE (hvt-ground: --detector-labels FILE) names them" in caplog.text
+
+
+def test_the_motion_detector_is_not_offered_as_a_classifier():
+    """``--classifier motion`` was "not known (did you mean motion?)"."""
+    with pytest.raises(UserError, match="classifier 'motion' is not known: give one of aerial-nano"):
+        is_calibrated("motion", role="classifier")
