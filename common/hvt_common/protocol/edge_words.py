@@ -30,9 +30,9 @@ STILL_WORDS: Mapping[str, str] = MappingProxyType(
         "no_gain": "look as they did in their last still",
         "refused": "refused a moment ago",
         "replaced": "replaced by a newer view",
-        "queue_full": "no room in the budget",
+        "queue_full": "less useful than others waiting",
         "too_large": "too large for the budget",
-        "stale": "waited too long for room in the budget",
+        "stale": "waited too long",
         "ended": "came too late: the flight ended",
         # What the ground made of it.
         "matched": "named a track",
