@@ -22,7 +22,7 @@ from rerun.chunk import Chunk
 
 from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer, of_file
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
 from hvt_common.video.hevc import is_keyframe
 from hvt_ground.events import VEHICLE, Notice, Overlay, PoseUpdate, VideoSample
@@ -242,11 +242,12 @@ class _File:
 
 
 def _opened(path: Path, spool: Spool, number: int) -> _File:
+    with telling(f"recording {path} cannot be read: "):
+        path.open("rb").close()
     with tempfile.TemporaryDirectory() as folder:
         try:
-            with path.open("rb"):
-                (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone
-                found = readable(name, Path(folder) / "readable.rrd")
+            (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone
+            found = readable(name, Path(folder) / "readable.rrd")
             if found is None:
                 raise ValueError("nothing in it can be read")
             file = _read(found, spool, number)

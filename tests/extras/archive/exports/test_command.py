@@ -382,8 +382,10 @@ def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
         stream.set_time("frame", duration=1.5)
         stream.log("/video", rr.VideoStream(codec=rr.VideoCodec.H265, sample=bytes(9)))
     assert "foreign.rrd is no recording" in refused(capsys, foreign, "--to", "mp4")
-    assert "absent.rrd is no recording" in refused(capsys, tmp_path / "absent.rrd", "--to", "mp4")
-    assert ". is no recording" in refused(capsys, Path(), "--to", "csv")
+    assert "absent.rrd cannot be read: No such file" in refused(
+        capsys, tmp_path / "absent.rrd", "--to", "mp4"
+    )
+    assert ". cannot be read: Is a directory" in refused(capsys, tmp_path / ".", "--to", "csv")
     assert "--to is missing: give one of mp4, mkv, ts" in refused(capsys, recording)
     assert "'avi'" in refused(capsys, recording, "--to", "avi")
     assert "--burn-in draws into video, and --to is csv" in refused(
