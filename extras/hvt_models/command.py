@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from hvt_common import __version__
 from hvt_common.errors import Parser, UserError, exit_with_sentence
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.plug_in import plug_in_names
@@ -48,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Models for --detector and --classifier: fetched once, checked at each use. "
         "They lie in the folder that HVT_MODELS names, else in the platform's cache folder.",
     )
+    parser.add_argument("--version", action="version", version=f"{_PROGRAM} {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
     one = commands.add_parser("list", help="every model that has a name, and what is here of it")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Final
 
+from hvt_common import __version__
 from hvt_common.errors import Parser, exit_with_sentence, needs_extra
 from hvt_common.runtime.process import interrupt_on_signals
 
@@ -52,6 +53,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(f"{_PROGRAM}: {words[0]} is called {now} from this release on", file=sys.stderr)
         words[0] = now
     parser = Parser(prog=_PROGRAM, description="Experiments with the stages of HVT, without a network.")
+    parser.add_argument("--version", action="version", version=f"{_PROGRAM} {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     with needs_extra("'hvt[study]'"):
         for name, summary in COMMANDS.items():

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from hvt_common import __version__
 from programs.refusal import checked, snapshot
 
 pytestmark = pytest.mark.integration
@@ -33,6 +34,12 @@ def test_one_sentence_and_exit_code_2(here, module, words, told):
     assert done.stdout == ""
     program = "hvt-" + module.removeprefix("hvt_").removesuffix(".cli")
     assert told in checked(done.stderr, program=program, left=snapshot(here) - before)
+
+
+@pytest.mark.parametrize("module", ["hvt_models.command", "hvt_study.cli"])
+def test_every_program_says_its_version(here, module):
+    """Who reports a fault would be told that a command is required."""
+    assert started(module, "--version", folder=here).stdout.endswith(f" {__version__}\n")
 
 
 def test_help_is_not_an_error(here):
