@@ -19,11 +19,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn, Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import tomli_w
 
-from hvt_common.errors import UserError, absent, check_not_read, named_path
+from hvt_common.errors import Parser, UserError, absent, check_not_read, named_path
 from hvt_common.files import read_text
 from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
@@ -171,11 +171,6 @@ class Loaded:
     print_config: bool
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message} (--help lists what is accepted)")
-
-
 def load(
     config_class: type[_Config], argv: Sequence[str] | None, *, program: str, description: str
 ) -> tuple[_Config, Loaded]:
@@ -191,14 +186,15 @@ def load(
     file = given.pop("config", None)
     values: dict[str, Any] = {}
     if file is not None:
-        values.update(_from_file(config_class, Path(_one(file, name="--config"))))
+        file = _path(_one(file, name="--config"), name="--config")
+        values.update(_from_file(config_class, file))
     for field in dataclasses.fields(config_class):  # type: ignore[arg-type]
         if field.name in given:
             values[field.name] = _value(field, given[field.name], name=_flag(field))
     if file is not None:
         for name, value in values.items():
             if isinstance(value, Path | str):
-                check_not_read(Path(value), [Path(file)], name=f"--{name.replace('_', '-')}")
+                check_not_read(Path(value), [file], name=f"--{name.replace('_', '-')}")
     return config_class(**values), Loaded(values=values, print_config=print_config)
 
 
@@ -261,7 +257,7 @@ def _flag(field: dataclasses.Field[Any]) -> str:
 def _flags(config_class: type, *, program: str, description: str, rare: bool) -> argparse.ArgumentParser:
     from hvt_common import __version__  # noqa: PLC0415  (only the version line needs it)
 
-    parser = _Parser(
+    parser = Parser(
         prog=program,
         description=description,
         argument_default=argparse.SUPPRESS,
@@ -357,8 +353,13 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
         if key.replace("_", "-") in _gone(config_class):
             raise UserError(f"{key} in {file} {_gone(config_class)[key.replace('_', '-')]}")
         if field is None:
-            near = difflib.get_close_matches(key, fields, n=1) or sorted(fields)
-            raise UserError(f"--config {file} has an unknown key {key!r}: did you mean {', '.join(near)}?")
+            near = difflib.get_close_matches(key.lower(), fields, n=1)
+            hint = f"did you mean {near[0]}?" if near else "a key is an option without its two dashes"
+            raise UserError(f"--config {file} has an unknown key {key!r}: {hint}")
+        if field.name in values:
+            raise UserError(
+                f"--config {file} has {key.replace('_', '-')} twice, with - and with _: give it once"
+            )
         try:
             values[field.name] = _value(field, given, name=f"{key} in {file}")
         except UserError as error:  # the value may be an address that was meant for another key

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import re
 import select
 import socket
 import sys
@@ -111,10 +112,29 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        self.register("type", Path, named_path)
+        self.register("type", Path, _given_path)
+        self.register("type", int, _number(int, "a whole number"))
+        self.register("type", float, _number(float, "a number"))
 
     def error(self, message: str) -> NoReturn:
+        message = re.sub(r"ignored explicit argument (.*)", r"\1 is given, and it takes no value", message)
         raise UserError(f"{message}; see {self.prog} --help")
+
+
+def _given_path(text: str) -> Path:
+    if not text.strip():  # else it is the folder that this runs in
+        raise argparse.ArgumentTypeError(f"{text!r} is empty: give a name")
+    return named_path(text)
+
+
+def _number(kind: type[float], accepted: str) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        try:
+            return kind(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not accepted: give {accepted}") from None
+
+    return parse
 
 
 def check_not_read(path: Path, reads: Iterable[Path], *, name: str) -> None:

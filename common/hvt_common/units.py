@@ -37,7 +37,9 @@ def parse_bitrate(text: str, *, name: str) -> int:
     if match:
         bps = float(match[1]) * _BITRATE_UNITS[(match[2] or "")[:1].lower()]
     if not match or not 1 <= bps <= _LIMIT_BPS:
-        raise UserError(f"{name} {text!r} is not a bitrate: write 800kbps, 0.8Mbps or 800000 (bits a second)")
+        raise UserError(
+            f"{name} {text!r} is not a bitrate: write 800kbps, 0.8Mbps or 800000 (bits a second), at most 1000Mbps"
+        )
     return round(bps)
 
 

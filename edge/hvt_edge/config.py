@@ -433,11 +433,7 @@ def check(config: EdgeConfig) -> EdgeConfig:
         )
     if config.passes_through:
         _check_passthrough(config)
-    if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S or config.window < 2 / config.nominal_fps:
-        raise UserError(
-            f"--window {config.window:g}s is not accepted: give {_LEAST_WINDOW_S:g}s to {_MOST_WINDOW_S:g}s, and two "
-            f"frames at least (shorter, and a keyframe fills more than a window)"
-        )
+    _check_window(config)
     if config.min_budget is not None and config.min_budget > config.budget_bps:
         raise UserError(
             f"--min-budget {config.min_budget / 1000:g} kbps is more than --budget "
@@ -445,7 +441,7 @@ def check(config: EdgeConfig) -> EdgeConfig:
         )
     if config.store and config.store < _LEAST_STORE_BYTES:
         raise UserError(
-            f"--store {config.store / 1e6:g}MB does not hold half a minute of video: give "
+            f"--store {BYTES.show(config.store)} does not hold half a minute of video: give "
             f"{_LEAST_STORE_BYTES // 10**6}MB or more, or 0 to store nothing"
         )
     _check_stills(config)
@@ -511,6 +507,19 @@ def _with_rates(config: EdgeConfig) -> EdgeConfig:
         raise UserError(f"--video-share {share:g} leaves no base stream: give {_LEAST_SHARE} to 1")
     depth = _R0_DEPTH if policy.name == "R0" and not config.roi_depth else config.roi_depth
     return replace(config, budget=config.budget or regime.budget_bps, video_share=share, roi_depth=depth)
+
+
+def _check_window(config: EdgeConfig) -> None:
+    if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S:
+        raise UserError(
+            f"--window {config.window:g}s is not accepted: give {_LEAST_WINDOW_S:g}s to {_MOST_WINDOW_S:g}s "
+            "(shorter, and a keyframe fills more than a window)"
+        )
+    if config.window < 2 / config.nominal_fps:
+        raise UserError(
+            f"--window {config.window:g}s is shorter than two frames of --fps {config.nominal_fps:g}: give "
+            f"--window {2 / config.nominal_fps:g}s or more, or another --fps"
+        )
 
 
 def _check_passthrough(config: EdgeConfig) -> None:

@@ -97,7 +97,9 @@ def test_what_was_set_is_told_apart_from_what_was_not(tmp_path):
     [
         ("budgte = 1", "unknown key 'budgte': did you mean budget?"),
         ("fitmode = 'crop'", "did you mean fit-mode?"),
-        ("zzz = 1", "did you mean budget, file, fit-mode"),
+        ("BUDGET = 1", "unknown key 'BUDGET': did you mean budget?"),
+        ("zzz = 1", "unknown key 'zzz': a key is an option without its two dashes"),
+        ("fit_mode = 'crop'\nfit-mode = 'crop'", "has fit-mode twice"),
         ("frames = 5.0", "frames in .* '5.0' is not accepted: give a whole number from 1 to 9 frames"),
         ("frames = true", "frames in .* True is not accepted: give one value"),
         ("frames = [1]", r"frames in .* \[1\] is not accepted: give one value"),
@@ -144,7 +146,7 @@ def test_a_file_that_cannot_be_read_is_one_sentence(tmp_path):
         (["--fram", "1"], "unrecognized arguments"),  # no abbreviations: they change with every new flag
         (["clip.mp4"], "unrecognized arguments: clip.mp4"),
         (["--fit-mode", "stretch"], "choose one of crop, letterbox"),
-        (["--loud=yes"], "ignored explicit argument"),
+        (["--loud=yes"], "argument --loud/--no-loud: 'yes' is given, and it takes no value"),
     ],
 )
 def test_a_wrong_flag_is_one_sentence(argv, said):

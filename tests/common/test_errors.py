@@ -60,6 +60,26 @@ def test_a_command_checks_its_files_too():
         parser.parse_args(["list", "a" * 300])
 
 
+@pytest.mark.parametrize(
+    ("kind", "text", "says"),
+    [
+        (
+            Path,
+            "",
+            "argument --it: '' is empty",
+        ),  # --out "$OUT" without OUT wrote into the folder that it ran in
+        (int, "1e3", "argument --it: '1e3' is not accepted: give a whole number; see x --help"),
+        (float, "3s", "argument --it: '3s' is not accepted: give a number"),
+    ],
+)
+def test_a_command_says_what_it_accepts(kind, text, says):
+    """It spoke of Python's types."""
+    parser = Parser(prog="x")
+    parser.add_argument("--it", type=kind)
+    with pytest.raises(UserError, match=says):
+        parser.parse_args([f"--it={text}"])
+
+
 ENDLESS = Path("/dev/zero")
 
 

@@ -232,3 +232,11 @@ def test_the_least_gain_reaches_the_suppression():
     assert make_suppression(config).min_gain == 3
     plain = check(load(EdgeConfig, ["--source", "demo", "--cooldown", "0"], program="p", description="")[0])
     assert make_suppression(plain).min_gain == 1
+
+
+def test_a_frame_rate_that_the_window_does_not_hold_is_refused_by_its_name():
+    """Who gave --fps 1 was told that a --window, which he had not given, is not accepted."""
+    with pytest.raises(
+        UserError, match="--window 1s is shorter than two frames of --fps 1: give --window 2s or"
+    ):
+        settled("--source", "demo", "--fps", "1")
