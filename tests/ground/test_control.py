@@ -238,7 +238,7 @@ def test_the_other_commands_ask_what_they_say(edge, words, asked):
         (["still", "--at", "soon", "--out", "a.png"], "--at 'soon' is not a duration"),
         (["set-budget", "much"], "the budget 'much' is not a bitrate"),
         (["keyframe", "--connect", "nowhere"], "endpoint 'nowhere' is not usable"),
-        (["still", "--track", "x", "--out", "a.png"], "invalid int value"),
+        (["still", "--track", "x", "--out", "a.png"], "is not accepted: give a whole number"),
     ],
 )
 def test_wrong_words_are_one_sentence_before_anybody_is_asked(words, said, capsys):

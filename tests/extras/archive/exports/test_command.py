@@ -385,7 +385,7 @@ def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
     assert "absent.rrd cannot be read: No such file" in refused(
         capsys, tmp_path / "absent.rrd", "--to", "mp4"
     )
-    assert ". cannot be read: Is a directory" in refused(capsys, tmp_path / ".", "--to", "csv")
+    assert f"{tmp_path} cannot be read: Is a directory" in refused(capsys, tmp_path, "--to", "csv")
     assert "--to is missing: give one of mp4, mkv, ts" in refused(capsys, recording)
     assert "'avi'" in refused(capsys, recording, "--to", "avi")
     assert "--burn-in draws into video, and --to is csv" in refused(
