@@ -105,8 +105,8 @@ def test_a_table_says_paths_and_names_as_they_are(capsys):
 
 def test_a_narrow_terminal_cuts_no_word(monkeypatch, capsys):
     """Of ``objects`` and ``preset`` it left ``obje…`` and ``pres…``."""
-    monkeypatch.setenv("COLUMNS", "12")
-    print_table("uav-1", [("total", "123456789 bytes")])
+    monkeypatch.setenv("COLUMNS", "24")
+    print_table("uav-1", [("not sent yet", "15 objects")])
     assert "…" not in capsys.readouterr().out
 
 
