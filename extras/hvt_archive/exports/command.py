@@ -95,9 +95,12 @@ def _rows(recorded: Recorded) -> Iterator[tuple[object, ...]]:
 def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
     """The name to write to; it takes the place of ``path`` at the end, and is removed where that fails.
 
+    A link stays one: what it leads to is replaced.
+
     Raises:
         UserError: it cannot be written, or is to be ``new`` and somebody has made one meanwhile.
     """
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path
     part = _part_of(path)
     if path.exists() and not path.is_file():  # moved over /dev/null, every program would fill the file
         raise UserError(f"{path} is there and no file: name a file with --out")

@@ -109,13 +109,16 @@ class McapFile(SinkWriter[Event]):
 
 
 def _location(pose: Pose) -> LocationFix:
-    """The camera's place; NaN for an altitude that nobody says."""
+    """The camera's place; NaN for an altitude that nobody says, and for its error."""
     spread = pose.position_error_m**2
+    altitude_m, vertical = pose.altitude_m, pose.height_error_m**2
+    if altitude_m is None:
+        altitude_m = vertical = math.nan
     return LocationFix(
         latitude=pose.latitude_deg,
         longitude=pose.longitude_deg,
-        altitude=math.nan if pose.altitude_m is None else pose.altitude_m,
-        position_covariance=[spread, 0, 0, 0, spread, 0, 0, 0, pose.height_error_m**2],
+        altitude=altitude_m,
+        position_covariance=[spread, 0, 0, 0, spread, 0, 0, 0, vertical],
         position_covariance_type=LocationFix.DIAGONAL_KNOWN,
     )
 

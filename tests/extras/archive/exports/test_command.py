@@ -456,6 +456,15 @@ def test_no_export_goes_over_the_recording_that_it_reads(recording, tmp_path, ca
     assert hvt_ground.cli.main(["export", str(source), "--to", kind, "--out", str(tmp_path / "new")]) == 0
 
 
+def test_a_link_stays_one(tmp_path):
+    """Who links the newest table to one place would read an old one for ever."""
+    (tmp_path / "link").symlink_to(tmp_path / "table")
+    with whole_file(tmp_path / "link") as part:
+        part.write_text("new", encoding="utf-8")
+    assert (tmp_path / "link").readlink() == tmp_path / "table"
+    assert (tmp_path / "table").read_text(encoding="utf-8") == "new"
+
+
 def test_recordings_are_not_joined_into_one_of_them(recording, tmp_path):
     """What the other edge saw would be all that is left."""
     source = tmp_path / "flight.rrd"

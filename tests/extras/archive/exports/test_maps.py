@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from rasterio.transform import from_origin
 import hvt_ground.cli
 from hvt_common.geodesy import metres_per_degree
 from hvt_common.values import Orientation, Pose, View
+from hvt_gateways.mcap.file import _location
 from hvt_geo.camera import places_of_boxes
 from hvt_ground.events import Overlay, PoseUpdate
 from hvt_ground.sinks.rerun.recorder import Recorder
@@ -243,6 +245,14 @@ def test_mcap_has_the_cameras_place(recording, tmp_path):
         ]
     assert [round(one.latitude, 4) for one in fixes] == [47.0] * 4
     assert fixes[0].altitude == pytest.approx(460.0)
+
+
+def test_mcap_knows_nothing_of_a_height_that_nobody_says():
+    """Three metres would be known of it."""
+    fix = _location(replace(pose_at(0), altitude_m=None))
+    assert math.isnan(fix.altitude)
+    assert math.isnan(fix.position_covariance[8])
+    assert fix.position_covariance[0] > 0
 
 
 @pytest.mark.parametrize("kind", ["geojson", "kml"])
