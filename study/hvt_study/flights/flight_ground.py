@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,6 +23,7 @@ from hvt_common.protocol.messages import (
     StillResult,
     TrackStep,
 )
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_edge.perception.shadow import Detected
@@ -67,6 +69,7 @@ class SharedModels(Models):
     ) -> None:
         self._shared = detector, classifier
         self.facts = ModelFacts.of(config or GroundConfig())
+        self.failures = Failures(time.time_ns)
         self.detector_thread = DetectorThread()
 
     def take(self) -> tuple[FailingDetector, Classifier | None]:
