@@ -136,7 +136,7 @@ def test_a_program_that_leaves_its_session_open_ends_the_watch(free_port: int) -
 import atexit, threading
 atexit.register(lambda: print(*(one.name for one in threading.enumerate() if one.name.startswith("hvt-"))))
 from hvt_common.transport.session import open_session
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings
 left = open_session(LinkSettings("ground", listen=("tcp/127.0.0.1:{free_port}",)))
 left.__enter__()
 """
