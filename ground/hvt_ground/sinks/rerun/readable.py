@@ -37,38 +37,51 @@ def readable(path: Path, out: Path) -> Path | None:
 
     After a power cut a file breaks off or ends in zeros, and cards lose bits.
     """
-    with _one_at_a_time:
-        try:
-            answer = _tries.answer(path, out) or _tries.answer(path, out)  # it may just have ended
-        except OSError:
-            return None
-    return {_WHOLE: path, _COPIED: out}.get(answer)
+    try:
+        found = _tries.found(path, out)
+    except OSError:
+        return None
+    return {_WHOLE: path, _COPIED: out}.get(found)
 
 
 class _Tries:
-    """The process that tries what can be read."""
+    """The process that tries what can be read, while files come; one at a time."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
+        self._lock, self._idle = threading.Lock(), threading.Timer(_IDLE_S, self.rest)
         atexit.register(self.end)
 
-    def answer(self, path: Path, out: Path) -> bytes:
-        """What it found, nothing if it ended; `OSError` where it does not start, or finds nothing in ten minutes."""
-        found = b""
+    def found(self, path: Path, out: Path) -> bytes:
+        """Nothing if it was killed; `OSError` where it does not start, or finds nothing in ten minutes."""
+        question = json.dumps([str(path.absolute()), str(out.absolute())]).encode() + b"\n"
+        with self._lock:
+            self._idle.cancel()
+            try:
+                return self._answer(question) or self._answer(question)
+            finally:
+                self._idle = threading.Timer(_IDLE_S, self.rest)
+                self._idle.daemon = True
+                self._idle.start()
+
+    def _answer(self, question: bytes) -> bytes:
+        answer = b""
         try:
             process = self._process = self._process or _started()
             if process.stdin and process.stdout:
                 with suppress(BrokenPipeError):
-                    process.stdin.write(
-                        json.dumps([str(path.absolute()), str(out.absolute())]).encode() + b"\n"
-                    )
+                    process.stdin.write(question)
                 if not select.select([process.stdout], [], [], _PATIENCE_S)[0]:
                     raise TimeoutError
-                found = process.stdout.read(1)
+                answer = process.stdout.read(1)
         finally:
-            if not found:
+            if not answer:
                 self.end()
-        return found
+        return answer
+
+    def rest(self) -> None:
+        with self._lock:
+            self.end()
 
     def end(self) -> None:
         process, self._process = self._process, None
@@ -83,7 +96,7 @@ def _started() -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, bufsize=0, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL)  # noqa: S603
 
 
-_one_at_a_time, _tries = threading.Lock(), _Tries()
+_tries = _Tries()
 
 
 def has_holes(path: Path, copy: Path) -> bool:
@@ -115,7 +128,7 @@ def main() -> None:
     answers = os.dup(1)
     os.dup2(2, 1)
     with os.fdopen(0, "rb", buffering=0) as questions:
-        while select.select([questions], [], [], _IDLE_S)[0] and (line := questions.readline()):
+        while line := questions.readline():
             os.write(answers, tried(*map(Path, json.loads(line))))
 
 
