@@ -21,11 +21,15 @@ class _RetriedModel(Retried[_Model], Generic[_Model]):
     def __init__(
         self, open_part: Callable[[], _Model], name: str, failures: Failures, **settings: Any
     ) -> None:
-        self.class_names: tuple[str, ...] = ()
+        begun: list[tuple[str, ...]] = []
 
-        def open_same() -> _Model:
+        def open_same() -> (
+            _Model
+        ):  # it does not hold this object: a session's model would outlast the session
             part = open_part()
-            if self.class_names and part.class_names != self.class_names:
+            if not begun:
+                begun.append(part.class_names)
+            elif part.class_names != begun[0]:
                 raise UserError(f"the {name} is another now, with other class names: a new start takes it")
             return part
 

@@ -88,14 +88,20 @@ class CaptureClock:
     def __init__(self, edge_clock: ClockOffset) -> None:
         self._edge_clock = edge_clock
         self._own_offset_ns: int | None = None
-        self._least_offset_ns = -(2**63)
-        """The camera's clock minus ours, if the quickest picture came at once."""
+        self._least_offset_ns, self._noted_ns = -(2**63), 0
+        """The camera's clock minus ours, if the quickest of the last pictures came at once; when one came last."""
 
     def note(self, capture_ns: int, *, received_ns: int) -> None:
         """Take the time of something that has just come."""
         if -_EARLY_NS <= received_ns - self._edge_clock.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
             self._own_offset_ns = None
-            self._least_offset_ns = max(self._least_offset_ns, capture_ns - received_ns)
+            offset_ns, error_ns = self._edge_clock.estimate or (0, 0)
+            most_ns = offset_ns + error_ns
+            before_ns = self._least_offset_ns - _drift_ns(received_ns - self._noted_ns)
+            least_ns = min(capture_ns - received_ns, most_ns)
+            # What an exchange has shown to be impossible since is of a clock that was set.
+            self._least_offset_ns = max(least_ns, before_ns) if before_ns <= most_ns else least_ns
+            self._noted_ns = received_ns
         elif self.is_sound or not 0 <= received_ns - self.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
             self._own_offset_ns = capture_ns - received_ns
 
@@ -119,5 +125,9 @@ class CaptureClock:
 
 def _agree(one: _Sample, other: _Sample) -> bool:
     # Whether some offset lies within the error of both, drift between them allowed for.
-    drift_ns = _DRIFT_PPM * abs(other.at_ns - one.at_ns) // 1_000_000 + _ROUNDING_NS
+    drift_ns = _drift_ns(other.at_ns - one.at_ns) + _ROUNDING_NS
     return 2 * abs(one.offset_ns - other.offset_ns) <= one.round_trip_ns + other.round_trip_ns + 2 * drift_ns
+
+
+def _drift_ns(passed_ns: int) -> int:
+    return _DRIFT_PPM * abs(passed_ns) // 1_000_000

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hvt_common.protocol.clock_offset import CaptureClock, ClockOffset
 from hvt_common.runtime.clock import SteadyClock
 
-MS = 1_000_000
+MS, SECOND_NS = 1_000_000, 1_000_000_000
 delays = st.integers(0, 5_000 * MS)
 
 
@@ -80,12 +80,28 @@ def test_no_picture_comes_before_it_was_captured():
     exchange(clock, at_ns=0, offset_ns=0, out_ns=10 * MS, held_ns=0, back_ns=2_010 * MS)
     for captured_ms, took_ms, shown_ms in ((3_000, 60, 0), (3_100, 20, 0), (3_200, 60, 40)):
         camera.note(captured_ms * MS, received_ns=(captured_ms + took_ms) * MS)
-        assert (captured_ms + took_ms) * MS - camera.to_local_ns(captured_ms * MS) == shown_ms * MS
+        delay_ns = (captured_ms + took_ms) * MS - camera.to_local_ns(captured_ms * MS)
+        assert abs(delay_ns - shown_ms * MS) < MS
     camera.note(9_000 * MS, received_ns=5_000 * MS)  # a camera that is ahead
     assert camera.is_sound
     assert camera.offset_ns == 10 * MS  # at most what the exchange leaves open
     exchange(clock, at_ns=9_000 * MS, offset_ns=0, out_ns=MS, held_ns=0, back_ns=MS)
-    assert camera.offset_ns == MS
+    camera.note(9_100 * MS, received_ns=9_120 * MS)
+    assert camera.offset_ns == 0, "of one that was ahead nothing is left"
+
+
+def test_the_quickest_picture_of_an_hour_ago_says_nothing_of_a_clock_that_drifts():
+    """The delay would grow for hours, by up to half a round trip."""
+    clock = ClockOffset()
+    camera = CaptureClock(clock)
+    for second in range(3600):
+        at_ns = second * SECOND_NS
+        offset_ns = -at_ns // 10_000
+        if second % 10 == 0:
+            exchange(clock, at_ns=at_ns, offset_ns=offset_ns, out_ns=300 * MS, held_ns=0, back_ns=300 * MS)
+        camera.note(at_ns + offset_ns, received_ns=at_ns + 310 * MS)
+    shown_ns = at_ns + 310 * MS - camera.to_local_ns(at_ns + offset_ns)
+    assert abs(shown_ns - 310 * MS) < 10 * MS  # what drifts in the minute that an exchange is kept
 
 
 def test_two_threads_may_use_it():
