@@ -76,6 +76,8 @@ def named_path(text: str, *, name: str = "") -> Path:
     `Path.exists` raises. `NotYetError` where the disk does not answer.
     """
     what = f"{name} {text!r}".lstrip()
+    if text == "-":
+        raise UserError(f"{what} is a standard stream elsewhere, and no file here: name a file")
     try:
         path = Path(text).expanduser()
         path.stat()

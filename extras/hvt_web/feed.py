@@ -114,8 +114,11 @@ class SessionFeed(SinkWriter[Event]):
         return (capture_ns - self._offset_ns) / _MILLION
 
     def _text(self, kind: str, item: Overlay | Refinement | Notice, **content: Any) -> str:
-        captured_ms = round(self._captured_ms(item.capture_ns), 1)
-        return text(kind, edge=self._info.edge, frame=item.frame_index, captured=captured_ms, **content)
+        frame, capture_ns = item.frame_index, item.capture_ns
+        if isinstance(item, Refinement):  # it was known later
+            frame, capture_ns = item.shown_at
+        captured_ms = round(self._captured_ms(capture_ns), 1)
+        return text(kind, edge=self._info.edge, frame=frame, captured=captured_ms, **content)
 
     def _overlay(self, item: Overlay) -> str:
         rows = zip(
@@ -152,8 +155,6 @@ class SessionFeed(SinkWriter[Event]):
             item,
             id=still,
             shows=[which for _, which, _, _ in pictures],
-            sequence=item.still_sequence,
-            shown=item.shown_index,
             track=item.track_id,
             box=[round(value, 1) for value in item.box_base_px],
             crop=None if item.crop_base_px is None else [round(value, 1) for value in item.crop_base_px],

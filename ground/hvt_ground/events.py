@@ -146,8 +146,23 @@ _OF_TRACKS = (
 )
 
 
+class Shown:
+    """A still that was known at ``frame_index``."""
+
+    __slots__ = ()
+    frame_index: int
+    capture_ns: int
+    header: RoiHeader | None
+
+    @property
+    def shown_at(self) -> tuple[int, int]:
+        """The frame that it shows, and when that was captured; as known where it has no header."""
+        of = self.header or self
+        return of.frame_index, of.capture_ns
+
+
 @dataclass(frozen=True, slots=True)
-class Refinement:
+class Refinement(Shown):
     """A still that was decoded and classified, and its effect on one object.
 
     A still that shows several objects makes one event for each, under the same number.
@@ -189,8 +204,6 @@ class Refinement:
     """``class_after`` has a calibrated probability above .9."""
     vague: tuple[bool, bool] = (False, False)
     """Of the class before and after, as `Overlay.vague`."""
-    shown_index: int = 0
-    """The frame that the still shows; ``frame_index`` is the one at which it was known."""
     header: RoiHeader | None = None
     """The still's own message, in source pixels; None where nobody has it."""
 

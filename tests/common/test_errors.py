@@ -25,6 +25,7 @@ from hvt_study.datasets.label_files import read_text as read_annotations
     [
         ("a" * 300, r"--out 'a+' cannot be looked at \(File name too long\)"),
         ("{folder}/loop/x", r"cannot be looked at \(Too many levels of symbolic links\)"),
+        ("-", "--out '-' is a standard stream elsewhere"),
         ("~nobody-of-that-name/x", "begins with a user that this machine does not know"),
     ],
 )

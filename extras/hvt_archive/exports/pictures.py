@@ -18,7 +18,7 @@ from hvt_ground.sinks.event_tables import plain_cells
 
 STILL_COLUMNS = ("file", "base_file", "frame_index", "capture_utc", "caption")
 """``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame_index`` is
-the one, from 0, at which the still was known; ``caption`` what it did, as under the pair on the screen."""
+the one, from 0, that the still shows; ``caption`` what it did, as under the pair on the screen."""
 _JPEG_QUALITY_PCT = 95
 
 
@@ -91,5 +91,6 @@ def write_stills(recorded: Recorded, folder: Path) -> None:
             for name, data in zip(names, (still.jpeg, still.base_jpeg), strict=True):
                 if name:
                     (folder / name).write_bytes(data)
-            row = (*names, still.frame_index, utc_text(still.capture_ns), still.caption)
+            frame_index, capture_ns = still.shown_at
+            row = (*names, frame_index, utc_text(capture_ns), still.caption)
             writer.writerow(plain_cells(row))

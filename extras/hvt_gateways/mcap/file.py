@@ -28,7 +28,7 @@ from hvt_common.files import check_there
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 from hvt_gateways.decodable import DecodableRun
-from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, VideoSample
+from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Shown, VideoSample
 from hvt_ground.recordings.row import RecordedStill
 from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.palette import Rgb, class_colour
@@ -89,8 +89,11 @@ class McapFile(SinkWriter[Event]):
     def _write(self, topic: str, message: _Message, at: FrameEvent | RecordedStill) -> None:
         if self._file.closed:
             return
+        frame_index, capture_ns = at.frame_index, at.capture_ns
+        if topic == "stills" and isinstance(at, Shown):
+            frame_index, capture_ns = at.shown_at
         # What no timestamp can hold is held at its end: times come from the wire.
-        capture_ns = min(max(at.capture_ns, 0), _LATEST_NS)
+        capture_ns = min(max(capture_ns, 0), _LATEST_NS)
         message.timestamp.CopyFrom(Timestamp(seconds=capture_ns // SECOND_NS, nanos=capture_ns % SECOND_NS))
         if isinstance(message, CompressedVideo | CompressedImage | LocationFix):
             message.frame_id = self._edge
@@ -103,7 +106,7 @@ class McapFile(SinkWriter[Event]):
                 message,
                 log_time=capture_ns,
                 publish_time=capture_ns,
-                sequence=max(0, at.frame_index) & 0xFFFFFFFF,
+                sequence=max(0, frame_index) & 0xFFFFFFFF,
             )
             self._file.flush()  # nothing to do but after a chunk
 

@@ -15,7 +15,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info, RoiHeader
 from hvt_common.runtime.statistics import Newest
 from hvt_common.video.hevc import parameter_sets
-from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Shown, VideoSample
 from hvt_ground.poses import Locator, PoseTrail
 
 _MOST_REMEMBERED = 4096
@@ -94,7 +94,7 @@ class FileAccount:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedStill:
+class RecordedStill(Shown):
     """A still as the recording shows it."""
 
     frame_index: int
@@ -141,7 +141,9 @@ class Recorded(ABC):
         for number, one in enumerate(self.video):
             if one.keyframe and parameter_sets(one.data):
                 return self.video[number:]
-        raise UserError(f"the recording of {self.edge} has no video: it was removed, or none came")
+        raise UserError(
+            f"the recording of {self.edge} has no video: it was removed, none came, or the file breaks off"
+        )
 
     def all(self) -> Iterator[VideoSample | Overlay | RecordedStill | Notice | PoseUpdate]:
         """All of it, in order of frames; of a frame the picture comes first."""

@@ -148,7 +148,7 @@ def _still_row(item: Refinement, name: str) -> tuple[object, ...]:
     x1, y1, x2, y2 = item.crop_base_px
     return (
         name,
-        item.shown_index,
+        item.shown_at[0],
         item.frame_index,
         item.still_sequence,
         "" if item.track_id is None else item.track_id,

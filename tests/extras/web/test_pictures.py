@@ -18,7 +18,7 @@ from hvt_web.video.pictures import Pictures
 from hvt_web.viewers import EdgePage
 from media.moving_square import FPS, SIZE, STEP_PX, moving_square
 from rigs.examples import refinement
-from rigs.messages import INFO
+from rigs.messages import INFO, PLAIN
 
 
 @pytest.fixture(scope="module")
@@ -177,13 +177,14 @@ def test_garbage_ends_nothing(samples):
     assert len(shown(came)) >= 59
 
 
-def test_a_still_is_called_as_its_box_is():
-    """The strip said truck beside a box that said vehicle."""
+def test_a_still_is_called_as_its_box_is_and_has_the_time_of_its_frame():
+    """The strip said truck beside a box that said vehicle, and when the still was read."""
     hub = MagicMock(post=lambda act: act())
     feed = SessionFeed(INFO, EdgePage("uav-1"), hub, clock=lambda: 0)
-    feed.log(refinement(class_after="truck", vague=(False, True)))
+    feed.log(refinement(class_after="truck", vague=(False, True), header=replace(PLAIN, frame_index=7)))
     _, message, _ = hub.still.call_args.args
-    assert '"before":"car","after":"vehicle"' in message.replace(" ", "")
+    assert '"before":"car","after":"vehicle"' in message
+    assert '"frame":7' in message
 
 
 @pytest.mark.parametrize(("codec", "kind"), [("libx264", "h264"), ("libx265", "hevc")])

@@ -136,7 +136,7 @@ def test_on_this_machine_the_page_opens_without_more(local):
 def test_a_still_is_where_others_are_told_that_it_is(port):
     """The link on a map would lead to another still, or to none."""
     flight = Flight(1)
-    still = refinement(still_sequence=12, shown_index=0)
+    still = refinement(still_sequence=12)
     with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as page:
         feed = page.feed(flight.info())()
         for number in (11, 12, 13):  # the twelfth is not the twelfth one that came

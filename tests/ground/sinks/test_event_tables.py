@@ -14,6 +14,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_ground.sinks.event_tables import StillFiles, TrackTable
 from rigs.examples import overlay, refinement
+from rigs.messages import PLAIN
 
 PIXELS = np.arange(12 * 20 * 3, dtype=np.uint8).reshape(12, 20, 3)
 STILL = refinement(
@@ -25,7 +26,7 @@ STILL = refinement(
     class_after="van",
     still_bgr=PIXELS,
     crop_base_px=(8.0, 9.0, 28.0, 21.0),
-    shown_index=9,
+    header=replace(PLAIN, frame_index=9),
 )
 
 

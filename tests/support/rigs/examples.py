@@ -162,6 +162,5 @@ def seen(
         class_after=posterior.class_name,
         confidence=posterior.confidence,
         reason="uncertainty",
-        shown_index=frame_index,
     )
     return StillSeen(event, posterior, side_px)

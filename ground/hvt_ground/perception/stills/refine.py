@@ -106,7 +106,7 @@ class Refiner:
         """
         by_frame: dict[int, list[StillSeen]] = {}
         for still, _ in self._held.values():
-            by_frame.setdefault(still.event.shown_index, []).append(still)
+            by_frame.setdefault(still.event.shown_at[0], []).append(still)
         resolved: list[StillSeen] = []
         for frame_index in sorted(by_frame):
             resolved += self._resolve_frame(by_frame[frame_index], history, now_frame, known_as)
@@ -177,7 +177,7 @@ class Refiner:
     def _resolve_frame(
         self, held: list[StillSeen], history: History, now_frame: int, known_as: Callable[[int], int | None]
     ) -> list[StillSeen]:
-        frame_index = held[0].event.shown_index
+        frame_index = held[0].event.shown_at[0]
         tracks = history.tracks(frame_index)
         if tracks is None:
             return self._resolve_untracked(held, history, now_frame, known_as)
@@ -205,7 +205,7 @@ class Refiner:
         resolved: list[StillSeen] = []
         oldest, newest = history.oldest_tracked, history.newest_tracked
         for still in held:
-            frame_index = still.event.shown_index
+            frame_index = still.event.shown_at[0]
             outcome: Outcome | None = None
             if oldest is not None and frame_index < oldest:
                 outcome = "late"
@@ -255,11 +255,11 @@ class Refiner:
             before = self._read(class_posterior, tracks, row)
         newest = class_posterior.update(
             still.posterior,
-            order=(still.event.shown_index, still.event.still_sequence),
+            order=(still.event.shown_at[0], still.event.still_sequence),
             side_px=still.side_px,
             news=still.news,
         )
-        self._touch(track_id, class_posterior, still.event.shown_index)
+        self._touch(track_id, class_posterior, still.event.shown_at[0])
         after = self._read(class_posterior, tracks, row)
         self.class_changes += after.class_id != before.class_id
         names = self._vocabulary.names

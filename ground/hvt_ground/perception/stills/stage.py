@@ -211,7 +211,7 @@ class StillStage:
         if event.track_id is not None:
             self._name_track(event, event.track_id)
             if found is not None and not event.stored:
-                self.fusion.take_box(event.track_id, found, frame_index=event.shown_index)
+                self.fusion.take_box(event.track_id, found, frame_index=event.shown_at[0])
         self._give_out(event, now)
 
     def _give_out(self, event: Refinement, now: Progress) -> None:
@@ -243,7 +243,6 @@ class StillStage:
             still_bgr=decoded.image_bgr,
             crop_base_px=self._to_base(header.crop_source_px),
             stored=bool(header.flags & Flags.STORED),
-            shown_index=header.frame_index,
             header=header,
         )
 

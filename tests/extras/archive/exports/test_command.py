@@ -30,7 +30,7 @@ import hvt_ground.cli
 from hvt_archive.exports.command import whole_file
 from hvt_archive.joined import join_recordings
 from hvt_common.errors import UserError
-from hvt_common.units import Limit
+from hvt_common.units import Limit, utc_text
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.session_files import SessionFiles
@@ -39,6 +39,7 @@ from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.rrd import Recording, damaged, ends_its_reader, recorded, settings
 from programs.small_disk import small_disk
+from rigs.messages import PLAIN
 
 FRAMES, SIZE, TRACKS = 60, (320, 192), 6
 
@@ -193,6 +194,19 @@ def test_the_stills_come_with_what_the_base_showed(recording, events, tmp_path):
     assert sum(bool(row["base_file"]) for row in rows) >= 20
     assert all(cv2.imread(str(out / row["base_file"])) is not None for row in rows if row["base_file"])
     assert any("→" in row["caption"] for row in rows)
+
+
+def test_a_still_has_the_time_of_what_it_shows(events, tmp_path):
+    """It is read a second later: beside the video it would be of another moment."""
+    still = next(one for one in events if isinstance(one, Refinement))
+    header = replace(PLAIN, frame_index=7, capture_ns=START_NS + 7 * STEP_NS)
+    late = replace(still, frame_index=30, capture_ns=START_NS + 30 * STEP_NS, header=header)
+    flight = recorded(tmp_path / "flight.rrd", [*events[:1], late])
+    (row,) = lines(export(flight, tmp_path / "stills", "--to", "stills") / "stills.csv")
+    assert (row["frame_index"], row["capture_utc"]) == ("7", utc_text(header.capture_ns))
+    with export(flight, tmp_path / "flight.mcap").open("rb") as file:
+        ((_, _, message),) = make_reader(file).iter_messages(topics=["/uav-1/stills"])
+    assert message.log_time == header.capture_ns
 
 
 def test_an_export_says_how_many_stills_came_beyond_those_it_has(recording, events, tmp_path, capsys):

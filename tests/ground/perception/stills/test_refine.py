@@ -454,5 +454,5 @@ def test_objects_that_stand_apart_are_never_confused(script):
     for done in resolved:
         assert done.event.track_id in (None, done.event.edge_track_id)
         if done.event.track_id is not None:
-            at_its_frame = ground.history.tracks(done.event.shown_index)
+            at_its_frame = ground.history.tracks(done.event.shown_at[0])
             assert at_its_frame is not None, "a lost frame refines nothing"
