@@ -1,8 +1,8 @@
 """Sends stored objects, chunk by chunk, until the ground acknowledges them. Time is an argument.
 
-First the facts of a session that is not the present one, then stills by their worth, then video, newest first; video
-first where a ground requested it. Of several objects some bytes may be on their way; in memory is the one of which
-chunks are being made. Where the ground does not get on, the object begins again where the ground left off.
+First come the facts of sessions other than the present one, then stills by their worth, then video, newest first;
+video goes first where a ground requested it. Bytes of several objects may be under way; only the object whose chunks
+are being made is in memory. An object without progress is sent again from the ground's acknowledged bytes on.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ _log = logging.getLogger(__name__)
 
 _PATIENCE_NS = 2 * SECOND_NS
 _TRIES, _TRIES_BEGUN = 3, 6
-"""Without getting on: of an object of which the ground has nothing, and of one that it has a part of."""
+"""Tries without progress: for an object of which the ground has nothing, and for one of which it has a part."""
 _MOST_ANSWERS = 300
-"""Without getting on, before they are no excuse any more: some minutes."""
+"""Answers without progress that still count as signs of life: some minutes of them."""
 _MOST_OBJECTS = 12
-"""On their way at a time; one report of the ground names 16."""
+"""Objects under way at a time; one report of the ground names 16."""
 _MOST_AHEAD_BYTES = 256 * 1024
 """Limit of one object's bytes beyond the acknowledged ones."""
 _LEAST_CHUNK_BYTES = 600
-"""A smaller one is mostly headers, unless it is the last."""
+"""A smaller chunk is mostly headers; only the last one may be smaller."""
 _OTHER_RECEIVER_NS = 5 * SECOND_NS
 
 
@@ -45,11 +45,11 @@ class _Transfer:
     acknowledged_bytes: int = 0
     tries: int = 0
     answers: int = 0
-    """Answers without progress of the ground: it is busy."""
+    """Answers of the ground without progress: it is busy."""
 
 
 class Backfill:
-    """For one thread. ``on_done(entry)`` is called for each object that a ground has whole."""
+    """For one thread. ``on_done(entry)`` is called for each object that a ground has completely."""
 
     def __init__(
         self, store: Store, *, session_id: int, on_done: Callable[[Entry], None] = lambda _entry: None
@@ -64,7 +64,7 @@ class Backfill:
         self._informed: set[int] = set()
         """Sessions whose facts the ground has."""
         self._requested: set[int] = set()
-        """Sessions whose facts it requested."""
+        """Sessions whose facts the ground has requested."""
         self._refused: set[ObjectKey] = set()
         """Objects that the present ground refuses; another ground, and the next start, offer them again."""
         self._acknowledged: dict[ObjectKey, int] = {}
@@ -75,19 +75,19 @@ class Backfill:
         """A ground requested the video."""
         self.acknowledged_bytes = 0
         self.given_up = 0
-        """Objects that were put aside because a ground did not take them."""
+        """Objects that were set aside because a ground did not take them."""
 
     @property
     def unacknowledged_bytes(self) -> int:
         """Bytes under way; for any thread."""
         return sum(one.sent_bytes - one.acknowledged_bytes for one in tuple(self.line.values()))
 
-    # What comes back
+    # Acknowledgements
 
     def on_acknowledged(
         self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int, now_ns: int
     ) -> None:
-        """Take in a ground's acknowledgements. One ground counts, until it reports none for a while."""
+        """Process a ground's acknowledgements. Only one ground counts, until it has sent none for a while."""
         if receiver_id != self._receiver_id:
             if self._receiver_id is not None and now_ns - self._reported_ns < _OTHER_RECEIVER_NS:
                 return
@@ -107,7 +107,7 @@ class Backfill:
                 self._requested.add(one.session_id)
 
     def _late(self, key: ObjectKey, acknowledged_bytes: int) -> None:
-        # The ground had it after all when it was put aside.
+        # The object was set aside although the ground had it.
         entry = self._store.find(key)
         data = None if entry is None else self._store.read(entry)
         if entry is not None and data is not None and acknowledged_bytes == len(data):
@@ -116,7 +116,7 @@ class Backfill:
             self._on_done(entry)
 
     def interrupt(self) -> None:
-        """The link is down: objects under way are begun again later, from the acknowledged bytes on."""
+        """The link is down: objects under way start again later, from the acknowledged bytes on."""
         self.line.clear()
         self.data = None
         self._forget()
@@ -138,17 +138,17 @@ class Backfill:
         if acknowledged_bytes > transfer.total_bytes:
             return
         key = transfer.entry.key
-        # By object, not by transfer: after an outage the ground says again what it has said before.
+        # By object, not by transfer: after an outage the ground acknowledges the same bytes again.
         self.acknowledged_bytes += max(0, acknowledged_bytes - self._acknowledged.get(key, 0))
         self._acknowledged[key] = acknowledged_bytes
         if acknowledged_bytes == transfer.total_bytes:
             self._done(transfer)
             return
-        if acknowledged_bytes < transfer.acknowledged_bytes:  # it was started again, or lost some
+        if acknowledged_bytes < transfer.acknowledged_bytes:  # the ground was restarted, or lost some
             transfer.sent_bytes = acknowledged_bytes
         elif acknowledged_bytes > transfer.acknowledged_bytes:
             transfer.tries, transfer.answers, transfer.since_ns = 0, 0, now_ns
-        elif transfer.answers < _MOST_ANSWERS:  # it is busy: only silence is a try that failed
+        elif transfer.answers < _MOST_ANSWERS:  # the ground is busy: only silence is a failed try
             transfer.tries, transfer.answers = 0, transfer.answers + 1
         transfer.acknowledged_bytes = acknowledged_bytes
         transfer.sent_bytes = max(transfer.sent_bytes, acknowledged_bytes)
@@ -168,10 +168,10 @@ class Backfill:
         if self.data is not None and self.data[0] == key:
             self.data = None
 
-    # What goes out
+    # Chunks
 
     def next_chunk(self, most_bytes: int, *, now_ns: int, round_trip_ns: int) -> Chunk | None:
-        """The next chunk, of at most so many bytes; None where there is none, or it would be too small."""
+        """The next chunk, of at most ``most_bytes``; None where no object waits or the chunk would be too small."""
         self._begin_again(now_ns - _PATIENCE_NS - round_trip_ns, now_ns)
         while (transfer := self._current(now_ns)) is not None:
             data = self._bytes_of(transfer)
@@ -188,7 +188,7 @@ class Backfill:
         return None
 
     def take_back(self, chunk: Chunk) -> None:
-        """This chunk has not been sent after all."""
+        """Note that this chunk was not sent after all."""
         transfer = self.line.get(chunk.key)
         if transfer is not None:
             transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)
@@ -216,13 +216,13 @@ class Backfill:
             )
         if transfer.entry.kind is BacklogKind.INFO:
             self._requested.discard(transfer.entry.session_id)
-            self._informed.add(transfer.entry.session_id)  # what follows shows whether it was needed
-        else:  # only a ground that has it, age or want of room may cost an object its place
+            self._informed.add(transfer.entry.session_id)  # later reports show whether it is needed
+        else:  # an object leaves the store only because a ground has it, for its age or for want of room
             self._forget()
             self._refused.add(transfer.entry.key)
 
     def _current(self, now_ns: int) -> _Transfer | None:
-        # The object of which chunks are made now: one that is not all on its way, or the next one.
+        # The object whose chunks are made now: the first that is not entirely under way, or the next one.
         for transfer in self.line.values():
             if transfer.sent_bytes < transfer.total_bytes:
                 self._in_hand = transfer.entry.key
@@ -259,7 +259,7 @@ class Backfill:
                 yield info
 
     def _bytes_of(self, transfer: _Transfer) -> bytes | None:
-        # The object's bytes, read again where another was read since; None where they are gone.
+        # The object's bytes, read again if another object was read since; None where they are gone.
         key = transfer.entry.key
         if self.data is None or self.data[0] != key:
             data = self._store.read(transfer.entry)

@@ -1,17 +1,17 @@
 """The store on disk: one SQLite file of objects (`entry`) and of the frames and stills that they are made of.
 
-A write is whole or not at all after a kill, and nothing is forced to disk but the database's own order: a power cut
-costs what the system had still in memory. The file shrinks with what is in it.
+After a kill each write is there entirely or not at all. Nothing is forced to disk but the database's own order, so a
+power cut costs the writes that the system still had in memory. The file shrinks with its contents.
 
-What has to go where the store is full, least useful first:
+When the store is full it deletes the least useful objects first:
 
-* **Video, oldest first**, as long as stills take less than a quarter of the space: the way to now is closer from a
-  short while ago than from an hour ago.
+* **Video, oldest first**, as long as stills take less than a quarter of the space: video of a short while ago says
+  more of the present than video of an hour ago.
 * **Stills by their worth**: the utility that their method gave, halved with each ten minutes. They are a hundredth
-  of the video's bytes and most of what it shows of an object, so the best outlive the video around them.
+  of the video's bytes and show most of an object's detail, so the best outlive the video around them.
 
-What earlier runs have stored is moved to the clock of this run when it is taken over, because that of an earlier one
-may have been years off: so ages and order are those of the time that has passed (`unwitnessed_ns`).
+The capture times of earlier runs are moved to the clock of this run when it takes their objects over, because an
+earlier clock may have been years off: ages and order then follow the time that has passed (`unwitnessed_ns`).
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ FILE_NAME = "backlog.sqlite"
 _STILLS_SHARE = 0.25
 _PAGE_BYTES = 4096
 _LOG_BYTES = 2 * 64 * _PAGE_BYTES
-"""Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
+"""Room for the write-ahead log: 64 pages are moved into the file, and the write before that may be a large one."""
 _REMOVED = "removed, with all that was stored"
 _TRIAL_BYTES = 64 * 1024
 _SET_NS = 60 * SECOND_NS
-"""From capture to store may pass some seconds, and no clock has been set for that."""
+"""Some seconds may pass from capture to store; a smaller difference does not mean that a clock was set."""
 _TRUSTED_SHARE = 1 / 4
-"""Of ``--store-age``: so much the clock's word counts at most for the time between two boots."""
+"""Share of ``--store-age`` that the clock may at most add for the time between two boots."""
 # One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
 _NEW = """
 PRAGMA page_size = 4096;
@@ -81,9 +81,9 @@ CREATE TEMP TABLE gone (id INTEGER PRIMARY KEY);
 CREATE TEMP VIEW here AS SELECT * FROM object WHERE id NOT IN (SELECT id FROM gone);
 COMMIT;
 """
-# `stored` is when the newest object was, by both clocks; `object.capture_ns` is by the clock of the run that has it.
-# `gone` is what has arrived and cannot be deleted yet, because a full disk has no space for the log either.
-# After a kill the segment that was open has no size yet.
+# `stored` is the time of the newest object, by both clocks; `object.capture_ns` is by the clock of the run that has
+# it. `gone` lists objects that have arrived and cannot be deleted yet, because a full disk has no space for the log
+# either. After a kill the segment that was open has no size yet.
 _ADOPT = """
 UPDATE object SET
     bytes = (SELECT total(length(data)) FROM part WHERE object = object.id),
@@ -99,19 +99,19 @@ _TOO_OLD = """
 SELECT id, session, kind, number FROM object WHERE kind <> 'info' AND capture_ns < ? ORDER BY capture_ns
 LIMIT (SELECT count(*) FROM object WHERE kind <> 'info') / 2
 """
-# Never all at once: where the ages are wrong after all, half is still there.
+# Never more than half at once: where the ages are wrong after all, half is still there.
 _PARTS = "SELECT frame_index, capture_ns, keyframe, data, crc FROM part WHERE object = ? ORDER BY rowid"
 _ENTRY = "SELECT id, session, kind, number, rank, span_ns FROM here"
 
 
 @dataclass(eq=False)
 class Store:
-    """The objects of this session and of those before it, in bounded space. For one thread; any may read the counts.
+    """The objects of this session and of earlier ones, in bounded space. For one thread; any may read the counts.
 
-    The folder is made when something is stored for the first time; ``max_bytes`` counts the file and its log.
-    ``info()`` is this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped by `enter`, though
-    never more than half of all; that is of ``clock``, as capture times are, Unix nanoseconds. ``since_boot()`` is the
-    boot and its nanoseconds.
+    The folder is made when the first object is stored; ``max_bytes`` counts the file and its log.
+    ``info()`` is this session's `Info`, packed. `enter` drops objects captured before ``oldest_ns``, but never more
+    than half of all; ``oldest_ns`` is by ``clock``, as capture times are, in Unix nanoseconds. ``since_boot()``
+    returns the boot's id and the nanoseconds since it.
     Every method raises `OSError` where the disk refuses, and can be called again.
     """
 
@@ -132,7 +132,7 @@ class Store:
         self._open: OpenSegment | None = None
         self._still_bytes = self._span_ns = 0
         self.disk_bytes = self.stills = self.segments = 0
-        """All that is here; the open segment does not count as one."""
+        """All objects in the store; the open segment does not count as a segment."""
         self.evicted_stills = self.evicted_segments = 0
         self.damaged = 0
         """Objects that were dropped because they could not be read."""
@@ -151,15 +151,15 @@ class Store:
         return self._span_ns + (0 if self._open is None else self._open.span_ns)
 
     def enter(self) -> None:
-        """Take over what earlier runs have stored, if they have.
+        """Take over the objects that earlier runs have stored, if any.
 
-        Raises `BlockingIOError` where another edge has the folder, which may be a predecessor that is about to end.
+        Raises `BlockingIOError` where another edge has the folder; that may be a predecessor that is about to end.
         """
         if self._file.exists():
             self._ready()
 
     def trial(self) -> None:
-        """Write and delete something; raises where the disk still refuses."""
+        """Write and delete a test row; raises where the disk still refuses."""
         with self._disk():
             db = self._writable()
             row = db.execute("INSERT INTO part (data) VALUES (zeroblob(?))", (_TRIAL_BYTES,)).lastrowid
@@ -169,7 +169,7 @@ class Store:
     # Storing
 
     def add_still(self, number: int, data: bytes, *, utility: float, capture_ns: int) -> None:
-        """Store a still; ``data`` is `pack_backlog_still`'s."""
+        """Store a still; ``data`` comes from `pack_backlog_still`."""
         with self._disk():
             db = self._writable()
             if self.find((self.session_id, BacklogKind.STILL, number)) is not None:
@@ -219,7 +219,7 @@ class Store:
         assert row is not None
         return row
 
-    # Giving back
+    # Reading
 
     def best_stills(self) -> Iterator[Entry]:
         return self._ranked(BacklogKind.STILL)
@@ -228,7 +228,7 @@ class Store:
         return self._ranked(BacklogKind.BASE)
 
     def info_of(self, session_id: int) -> Entry | None:
-        """The facts of a session; None where they are not here."""
+        """The facts of a session; None where the store has none."""
         return self.find((session_id, BacklogKind.INFO, 0))
 
     def find(self, key: ObjectKey) -> Entry | None:
@@ -237,9 +237,9 @@ class Store:
         return next(self._entries(where, f"{session_id:016x}", kind, number), None)
 
     def read(self, entry: Entry) -> bytes | None:
-        """The object's bytes as they cross the link; one that is damaged is dropped, with a warning, and None.
+        """The object's bytes as they cross the link; a damaged object is dropped with a warning, and gives None.
 
-        Of a segment: its frames up to the first damaged one.
+        A segment gives its frames up to the first damaged one.
         """
         parts: list[tuple[Any, ...]] = []
         for *facts, data, crc in self._rows(_PARTS, entry.row):
@@ -256,7 +256,7 @@ class Store:
         return None
 
     def remove(self, entry: Entry) -> None:
-        """It has arrived, or has to make room; with the last of a former session its facts go too."""
+        """Delete an object that has arrived or must make room; a former session's facts go with its last object."""
         if self._db is not None:
             with self._disk():
                 self._db.execute("INSERT OR IGNORE INTO gone VALUES (?)", (entry.row,))
@@ -270,7 +270,7 @@ class Store:
             db.execute(_TIDY, (self._session,))
 
     def close(self) -> None:
-        """End the open segment and let another process have the file; what is left still counts."""
+        """End the open segment and release the file for other processes; the counts stay as they are."""
         try:
             self.end_segment()
             if self._db is not None:
@@ -295,9 +295,9 @@ class Store:
         for row in self._rows(select, *values):
             try:
                 entry = entry_of(row)
-            except ValueError as error:  # somebody else has written it
+            except ValueError as error:  # another program has written it
                 self._note_damaged(f"{self._file}: {error}")
-                with self._disk():  # not seen again; it is deleted with what has arrived
+                with self._disk():  # hidden from now on; deleted together with arrived objects
                     assert self._db is not None, "it was just read"
                     self._db.execute("INSERT OR IGNORE INTO gone VALUES (?)", (row[0],))
                 self._count()
@@ -320,7 +320,7 @@ class Store:
             if not self.evicted_stills + self.evicted_segments:
                 megabytes = self.max_bytes // 10**6
                 _log.warning("the store is full (--store %d MB): the least useful goes", megabytes)
-            # Not `remove`: where even this takes space that is not there, all would go in vain.
+            # Not `remove`: if this too needs space that is not there, all objects would go in vain.
             with self._disk():
                 db.execute("DELETE FROM object WHERE id = ?", (least.row,))
             self.evicted_stills += kind is BacklogKind.STILL
@@ -348,7 +348,7 @@ class Store:
             return self._db
 
     def _writable(self) -> sqlite3.Connection:
-        # With this session's facts in it.
+        # The open database with this session's facts in it.
         if self._db is not None and not self._file.exists():
             self._lose()
             raise FileNotFoundError(errno.ENOENT, _REMOVED, str(self._file))
@@ -373,7 +373,7 @@ class Store:
         return db
 
     def _take_over(self, db: sqlite3.Connection) -> None:
-        # Take over the unexpired objects of earlier runs. A full disk refuses that, and can still be read.
+        # Take over the unexpired objects of earlier runs. A full disk refuses the update, and can still be read.
         with contextlib.suppress(sqlite3.OperationalError):
             db.executescript(_ADOPT)
             self._move_times(db)
@@ -396,7 +396,7 @@ class Store:
 
     def _move_times(self, db: sqlite3.Connection) -> None:
         found = db.execute("SELECT capture_ns, boot, steady_ns FROM stored").fetchone()
-        if found is None:  # a version that did not note it, if any
+        if found is None:  # written by a version that did not note it, if by any
             (newest_ns,) = db.execute("SELECT max(capture_ns) FROM object WHERE kind <> 'info'").fetchone()
             if newest_ns is None:
                 return
@@ -424,7 +424,7 @@ class Store:
 
     @contextlib.contextmanager
     def _disk(self) -> Iterator[None]:
-        # Errors of the database are errors of the disk; all but want of space end the connection.
+        # Database errors are raised as disk errors; any but want of space ends the connection.
         try:
             yield
         except sqlite3.Error as error:
@@ -448,7 +448,7 @@ class Store:
 
 
 def _packed(parts: list[tuple[Any, ...]]) -> bytes:
-    # A segment's bytes; none where no ground would read its frames: somebody else has written them.
+    # A segment's bytes; none where no ground would read its frames, because another program has written them.
     units = [BacklogUnit(index, at_ns, bool(key), unit) for index, at_ns, key, unit in parts]
     try:
         packed = pack_backlog_units(units)

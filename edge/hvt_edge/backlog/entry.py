@@ -11,28 +11,28 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
 FIRST_STORED = 2**31
-"""Stills that are stored for later have numbers of their own: those that are sent have no holes then."""
+"""Stored stills have numbers of their own, from here on, so that the numbers of sent stills have no gaps."""
 SEGMENT_NS = 10 * SECOND_NS
-"""A keyframe is wanted when a segment is so long: eviction and sending go by segments."""
+"""Length of a segment, after which a keyframe is wanted: eviction and sending go by segments."""
 _HALF_LIFE_NS = 600 * SECOND_NS
 _LEAST_STRENGTH = -60.0
 MOST_UNIT_BYTES = _MOST_SEGMENT_BYTES = MAX_BACKLOG_BYTES - 512 * 1024
-"""A larger access unit would be more than any ground takes in one object."""
+"""Limit of an access unit and of a segment: a larger one is more than any ground takes in one object."""
 _MOST_SEGMENT_UNITS = 2400
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One object that is stored."""
+    """One stored object."""
 
     row: int
     session_id: int
     kind: BacklogKind
     number: int
     rank: float
-    """The least rank is deleted first if the store is full: worth of a still, age of a segment."""
+    """The object of least rank is deleted first when the store is full: worth of a still, start time of a segment."""
     span_ns: int
-    """The length of video: from its first frame to its last."""
+    """The length of the video: from its first frame to its last."""
 
     @property
     def key(self) -> ObjectKey:
@@ -43,7 +43,7 @@ class Entry:
 
 
 def entry_of(values: tuple[Any, ...]) -> Entry:
-    """Read a row of the file, in the order of `Entry`; `ValueError` for one that no edge has written."""
+    """Read a row of the file, in the order of `Entry`; raises `ValueError` for a row that no edge has written."""
     row, session, kind, number, rank, span_ns = values
     kinds = [type(one) for one in (session, kind, number, rank, span_ns)]
     if kinds != [str, str, int, float, int] or not (0 <= number < 2**32 and span_ns >= 0):
@@ -56,7 +56,7 @@ def entry_of(values: tuple[Any, ...]) -> Entry:
 
 @dataclass(slots=True)
 class OpenSegment:
-    """The segment that is being written, and which unit begins the next."""
+    """The segment that is being written, and the rule for the unit that begins the next."""
 
     row: int
     first: AccessUnit
@@ -83,7 +83,7 @@ class OpenSegment:
 
 
 def worth(utility: float, capture_ns: int) -> float:
-    """A still's binary logarithm of utility, plus its time in half-lives: so the order never changes."""
+    """A still's worth: log2 of its utility plus its time in half-lives, so the order of two stills never changes."""
     if utility > 0:
         strength = max(_LEAST_STRENGTH, math.log2(min(utility, 1e12)))
     else:
@@ -92,5 +92,5 @@ def worth(utility: float, capture_ns: int) -> float:
 
 
 def moved_rank(kind: BacklogKind, moved_ns: int) -> float:
-    """The change of an object's rank if its time moves by so much."""
+    """The change of an object's rank when its time moves by ``moved_ns``."""
     return moved_ns / _HALF_LIFE_NS if kind is BacklogKind.STILL else float(moved_ns)

@@ -1,7 +1,7 @@
 """Decides for frames and stills while the link may be down: send, or store.
 
-The edge goes over to storing at once and comes back with a keyframe: until that has gone out frames are still stored,
-because the ground could not show them. So between what was sent and what was stored no frame is missing.
+The edge turns to storing at once and returns with a keyframe. Until that keyframe has gone out frames are still
+stored, because the ground could not show them; so no frame is missing between the sent ones and the stored ones.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from hvt_edge.link.transmitter import LEAST_CHUNK_BYTES, Transmitter
 from hvt_edge.operating import Keyframes
 
 SILENCE_NS = 3 * SECOND_NS // 2
-"""Three reports in a row that did not come."""
+"""Three reports in a row are missing."""
 _NO_NEWS_NS = 5 * SECOND_NS
-"""Reports come and name no newer picture: small messages pass, or those of one direction, and the video does not."""
+"""Reports come but name no newer frame: small messages pass, or only one direction works, and the video does not."""
 _PAUSE_NS = 2 * SECOND_NS
-"""Nothing has gone out for so long, nor for 1.5 of the time between the last two: what is not named is no news of the
-link."""
+"""After this time without a message sent, and 1.5 times the interval of the last two, a report that names no newer
+frame says nothing of the link."""
 _LEFT_NS = 15 * SECOND_NS
-"""Who is silent for so long on a link that Zenoh still has, has left; others may subscribe that never report. As in
-`hvt_edge.link.pacer`."""
+"""A ground that is silent for this long on a link that Zenoh still has, has left; the remaining subscribers may never
+report. As in `hvt_edge.link.pacer`."""
 _STEADY_NS = 2 * SECOND_NS
-"""The link is back for so long before stored objects are sent: the picture comes first."""
+"""How long the link must be back before stored objects are sent: live video comes first."""
 _PROBE_NS = SECOND_NS
 _RESERVE = 1 / 3
 """Share of the stills' part of a window that stays free for a live one; all of it while one is pending."""
 _TRICKLE_BYTES = 1_400
-"""Size of a chunk without room: one packet."""
+"""Size of a chunk that goes without room in the budget: one packet."""
 _FINISH_NS, _STUCK_NS, _POLL_S = 60 * SECOND_NS, 6 * SECOND_NS, 0.05
-"""How long sending goes on after the end of a clip: in all, and without getting on."""
+"""How long sending goes on after the end of a clip: in all, and without progress."""
 
 
 class Outage:
-    """Whether the link is down. Time is an argument. ``live``: the source is a camera, which waits for nobody.
+    """Tells whether the link is down. Time is an argument. ``live``: the source is a camera, which cannot wait.
 
-    It is down if nobody subscribes any more (Zenoh notices that some seconds after the link broke), or if a ground
+    The link is down if nobody subscribes any more (Zenoh notices that some seconds after the link broke), if a ground
     that used to report is silent (it reports twice a second whatever it receives, so this is noticed much sooner), or
-    has no news.
+    if its reports have no news.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -58,14 +58,14 @@ class Outage:
         self._news_ns = self._grew_ns = self._each_ns = 0
         self._named = self._sent = -1
         self._named_ns = -SILENCE_NS
-        """When somebody named a message."""
+        """When a report last named a base message."""
         self.reports = False
-        """Whether a ground ever reported on this session: without reports nobody knows what has arrived."""
+        """Whether a ground has ever reported on this session: without reports no arrival is known."""
 
     def reported(self, now_ns: int, *, named: int = -1, sent: int = -1) -> None:
-        """A ground has reported on this session (any thread): the last base message that came, of those ``sent``.
+        """A ground has reported (any thread): ``named`` is the last base message that it received, of those ``sent``.
 
-        Who takes no video names none, and has no news of it; beside somebody who reports some it is none.
+        A ground that takes no video names none (-1); that is no news while another ground reports video.
         """
         again = not self.reports_now(now_ns)
         if sent > self._sent:
@@ -92,12 +92,12 @@ class Outage:
     def offline(self, now_ns: int, *, linked: bool) -> bool:
         """Whether the link is away; called before each frame. ``linked``: Zenoh reports a subscriber.
 
-        Before anybody ever subscribed, only a live source is stored: a clip plays again.
+        Before the first subscription only a live source is stored: a clip can be played again.
         """
         if not linked:
             self._linked = False
             return self._subscribed or self._live
-        if not self._linked:  # a new path: the silence of before says nothing about it
+        if not self._linked:  # a new path: earlier silence says nothing about it
             self._linked = self._subscribed = True
             self._reported_ns = None
         reported_ns = self._reported_ns
@@ -122,8 +122,8 @@ class BacklogStage:
     `store_still` is for the threads of stills, `on_feedback` for any, the rest for the frame loop.
 
     ``has_subscriber()``: a ground subscribes to ``backlog``. ``stills_pending()``: a live still waits for its
-    allowance; ``stills_in_flight()``: how many were sent that no report has named. What an outage loses of stills is
-    the outbox's: it takes its own for lost whenever `breaks` has grown.
+    allowance; ``stills_in_flight()``: how many were sent that no report has named. The outbox handles stills lost in
+    an outage: it takes its own for lost whenever `breaks` has grown.
     """
 
     def __init__(
@@ -151,10 +151,10 @@ class BacklogStage:
         self._segment_ns: int | None = None
         self._probed_ns = 0
         self.frames = 0
-        """Stored, to be sent later; those included that went out too, to find out whether the link is back."""
+        """Frames stored to be sent later; they include those also sent as probes of whether the link is back."""
         self.max_bytes = store.max_bytes
         self.breaks = 0
-        """How often the messages in flight have been taken for lost."""
+        """How often the messages in flight have been declared lost."""
         self.worker = StoreWorker(
             store,
             session_id=line.session_id,
@@ -174,7 +174,7 @@ class BacklogStage:
         return self.state is State.OFFLINE
 
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
-        """Before each frame: whether the link is down. Raises the error that has ended the store's thread."""
+        """Called before each frame: whether the link is down. Raises the error that has ended the store's thread."""
         self.worker.check()
         self._linked = linked
         offline = self._outage.offline(now_ns, linked=linked) and not self.worker.failed
@@ -192,11 +192,11 @@ class BacklogStage:
 
     @property
     def segment_open(self) -> bool:
-        """Whether the open segment goes on from a keyframe without a hole."""
+        """Whether the open segment continues from a keyframe without a gap."""
         return self._segment_ns is not None
 
     def base(self, unit: AccessUnit, *, now_ns: int, sent: bool = False) -> bool:
-        """Store a frame; ``sent``: it goes out too. False where the store does not take it."""
+        """Store a frame; ``sent``: it is sent too. False where the store does not take it."""
         if sent:
             self._probed_ns = now_ns
         if unit.keyframe:
@@ -204,7 +204,7 @@ class BacklogStage:
         taken = self.worker.offer(unit)
         self.frames += taken
         if not taken:
-            self._segment_ns = None  # what follows can be shown from a keyframe on only
+            self._segment_ns = None  # later frames can be shown only from the next keyframe on
         return taken
 
     def probe_due(self, now_ns: int) -> bool:
@@ -213,7 +213,7 @@ class BacklogStage:
 
     def resume(self) -> None:
         """Send the keyframe that was made for the restart, and all later frames."""
-        self._lose_in_flight()  # stills that went out while the link was going, or coming
+        self._lose_in_flight()  # stills that were sent while the link went down or came back
         self.worker.intake.end_segment()
         self.state = State.LIVE
 
@@ -227,11 +227,9 @@ class BacklogStage:
     def _lose_in_flight(self) -> None:
         units = self._line.in_flight.take()
         self.breaks += 1
-        if (
-            self.state is State.LIVE
-        ):  # else these were to show whether the link is back, and are stored already
+        if self.state is State.LIVE:  # else these were probes of the link, and are stored already
             whole = True
-            for unit in units:  # behind one that the disk does not take, what builds on it is of no use
+            for unit in units:  # without one that the disk refuses, none up to a keyframe can be decoded
                 whole = (whole or unit.keyframe) and self.worker.offer(unit)
 
     # The end of the run
@@ -239,10 +237,10 @@ class BacklogStage:
     def finish(
         self, *, before_frame: Callable[[int], None], stop: threading.Event, note: Callable[[str], None]
     ) -> None:
-        """After the last frame of a recorded source: send what is stored, for as long as that gets on.
+        """After the last frame of a recorded source: send stored objects, for as long as there is progress.
 
-        ``before_frame(now_ns)`` is what else goes before each frame: it calls the one here, and lets the outbox store
-        what is lost. No still is made any more.
+        ``before_frame(now_ns)`` does all that comes before a frame: it calls `before_frame` here, and lets the outbox
+        store lost stills. No still is made any more.
         """
         self._finishing = True
         began_ns = progress_ns = self._clock()
@@ -270,11 +268,11 @@ class BacklogStage:
 
     @property
     def _unnamed(self) -> bool:
-        # Whether something is not acknowledged, by a ground that does acknowledge.
+        # Whether a message is unacknowledged, by a ground that does acknowledge.
         return self._outage.reports and bool(len(self._line.in_flight) or self._stills_in_flight())
 
     def end_in_flight(self) -> None:
-        """The run ends: messages that no report has named are stored, and sent as stored ones."""
+        """The run ends: messages that no report has named are stored, and sent from the store."""
         if self._unnamed:
             self._lose_in_flight()
             self.worker.intake.end_segment()
@@ -284,24 +282,24 @@ class BacklogStage:
     def store_still(self, still: BacklogStill, *, number: int, capture_ns: int, utility: float) -> None:
         self.worker.offer(IntakeStill(number, capture_ns, utility, still))
 
-    # What comes back
+    # Reports
 
     def on_feedback(self, feedback: Feedback, *, now_ns: int) -> None:
         """A ground has reported on this session (any thread)."""
         named = feedback.base_sequence
-        # After the last frame nothing could show that one before it was lost.
+        # After the last frame no later one can show that an earlier one was lost.
         sent = named if self._finishing else self._line.base_sequence
         self._outage.reported(now_ns, named=named, sent=sent)
         if feedback.backlog:
             self.worker.intake.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)
 
     def send_video(self) -> bool:
-        """Somebody wants the video before the stills; False where nothing is kept."""
+        """A ground requested the video before the stills; returns False where nothing is stored."""
         self.worker.intake.signal(video_first=True)
         return not self.worker.numbers.empty
 
     def wait_for_end(self, *, timeout_s: float) -> bool:
-        """After `StoreWorker.send_no_more`: wait until a ground has all that was sent; False after the time-out."""
+        """After `StoreWorker.send_no_more`: wait until a ground has all sent bytes; False after the time-out."""
         until_ns = self._clock() + round(timeout_s * SECOND_NS)
         while self.worker.numbers.unacknowledged_bytes:
             if self._clock() >= until_ns:
@@ -310,14 +308,14 @@ class BacklogStage:
         return True
 
     def close(self) -> None:
-        """Store unacknowledged messages, and leave the store in order; after the last report."""
+        """Store unacknowledged messages and close the store; called after the last report."""
         try:
             self.end_in_flight()
         finally:
             self.worker.close()
 
     def _note_sent(self, entry: Entry) -> None:
-        # A lower number was lost in an outage and counted when it was sent; a former run has its own ledger.
+        # A lower number was lost in an outage and counted when it was sent; another run has its own ledger.
         own = entry.session_id == self._line.session_id and entry.number >= FIRST_STORED
         if own and entry.kind is BacklogKind.STILL:
             self._line.outcome("sent", "stored")
@@ -325,17 +323,17 @@ class BacklogStage:
     # How chunks leave
 
     def chunk_allowance(self, now_ns: int) -> ChunkAllowance | None:
-        """Bytes that a chunk may take now. None: the link is not steady, no ground reports, or a keyframe is due."""
+        """Allowance of a chunk now. None: the link is not steady, no ground reports, or a keyframe is due."""
         if self.state is not State.LIVE or not self._linked or now_ns - self._back_ns < _STEADY_NS:
             return None
         if not self._outage.reports_now(now_ns):
-            return None  # of who only listens nobody would know what has arrived
-        # While a keyframe is to come nothing else takes its space; after the last frame none comes.
+            return None  # a ground that only listens acknowledges nothing
+        # While a keyframe is due nothing else takes its room; after the last frame none is due.
         if not self._has_subscriber() or not (self._finishing or not self._keyframes.due(now_ns)):
             return None
         reserve = 0.0 if self._finishing else 1.0 if self._stills_pending() else _RESERVE
         limit_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=reserve)
         if self._finishing or limit_bytes >= LEAST_CHUNK_BYTES:
-            return ChunkAllowance(limit_bytes)  # after the last frame no still goes any more
+            return ChunkAllowance(limit_bytes)  # after the last frame no still is sent any more
         own_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=None)
         return ChunkAllowance(min(_TRICKLE_BYTES, own_bytes), trickle=True)

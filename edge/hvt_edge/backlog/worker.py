@@ -1,9 +1,9 @@
-"""The thread that the disk belongs to: it writes what is stored, and makes chunks of it when the link allows.
+"""The thread that owns the disk: it writes objects, and makes chunks of stored ones when the link allows.
 
-What comes to it waits in a bounded queue (`Intake`). Where that is full the disk is too slow: what comes then is not
-stored, and said once. While a disk is full, cannot be written or is gone, nothing is stored; what is there already is
-sent all the same. Any other error, of a file that somebody has changed or of this program, stops storing or sending
-alone, and it is tried again: video needs neither. Chunks leave in a thread of their own (`ChunkThread`).
+Objects wait for it in a bounded queue (`Intake`). When the queue is full the disk is too slow: later objects are not
+stored, and the log says so once. While a disk is full, read-only or gone, nothing is stored; objects already there
+are sent all the same. Any other error, of a file that another program has changed or of this one, stops storing or
+sending alone, which is tried again: video needs neither. Chunks leave in a thread of their own (`ChunkThread`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class IntakeStill:
 
 @dataclass(frozen=True, slots=True)
 class EndSegment:
-    """The frames before this are an object; it has its place among them."""
+    """Marks the end of a segment: the queued frames before it are one object."""
 
 
 Item = AccessUnit | IntakeStill | EndSegment
@@ -63,7 +63,7 @@ class News:
 
     woken: bool = False
     interrupted: bool = False
-    """The link went: nothing is under way."""
+    """The link went down: nothing is under way."""
     video_first: bool = False
     """A ground requested the video."""
     acknowledged: Newest[tuple[int, ObjectKey], AcknowledgedRange] = field(
@@ -73,10 +73,10 @@ class News:
 
 
 class Intake:
-    """From any thread to one. Holds ``most`` frames and stills, and a signal for each of them at the most.
+    """A queue from any thread to one. Holds ``most`` frames and stills, and at most one signal for each.
 
-    A disk that is too slow costs frames and stills, and says so. It must not cost a signal: a segment that does not
-    end would cost much more. So signals are states, not items.
+    A disk that is too slow costs frames and stills, and the log says so. It must not cost a signal: a segment without
+    an end would cost much more. So signals are states, not items.
     """
 
     def __init__(self, most: int) -> None:
@@ -93,7 +93,7 @@ class Intake:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing waits, and nothing is in hand since the last `take`."""
+        """Whether no item waits and the last `take` returned none."""
         with self._changed:
             return not (self._items or self._in_hand)
 
@@ -105,7 +105,7 @@ class Intake:
     # From any thread
 
     def offer(self, item: AccessUnit | IntakeStill) -> bool:
-        """Hand over something to be stored; False where there is no space for it."""
+        """Queue an item to be stored; False where the queue is full."""
         with self._changed:
             if self._closed or self._queued >= self._most:
                 return False
@@ -115,14 +115,14 @@ class Intake:
         return True
 
     def end_segment(self) -> None:
-        """The frames offered so far are an object."""
+        """The frames offered so far are one object."""
         with self._changed:
             if not (self._items and isinstance(self._items[-1], EndSegment)):
                 self._items.append(EndSegment())
                 self._changed.notify()
 
     def signal(self, *, interrupted: bool = False, video_first: bool = False, closed: bool = False) -> None:
-        """Something has happened, see `News`; or only let `take` return. ``closed``: nothing more comes."""
+        """Signal an event of `News`, or only let `take` return. ``closed``: no further item comes."""
         with self._changed:
             self._news.interrupted |= interrupted
             self._news.video_first |= video_first
@@ -130,7 +130,7 @@ class Intake:
             self._wake()
 
     def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
-        """A ground acknowledges bytes; the newest report counts, and a lost one comes again."""
+        """A ground acknowledges bytes; the newest report counts, and one that is lost is repeated."""
         with self._changed:
             for one in acknowledged_ranges:
                 self._news.acknowledged.put((receiver_id, one.key), one)
@@ -143,7 +143,7 @@ class Intake:
     # In the thread that takes
 
     def take(self, timeout_s: float) -> tuple[News, Item | None]:
-        """The events, and the next item; None if there is none within that time, or something happened."""
+        """The events and the next item; None where no item came within ``timeout_s``, or an event came first."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._news.woken, timeout=timeout_s)
             news, self._news = self._news, News()
@@ -156,35 +156,35 @@ class Intake:
 _log = logging.getLogger(__name__)
 
 _PART, _SENDING_PART = "store", "backlog"
-"""The names of storing and of sending among the parts that may fail."""
+"""The names of storing and of sending among the parts whose failures are reported."""
 _QUEUE = 512
 _BUSY_S = 0.02
 _IDLE_S = 0.25
 _CLOSE_S = 5.0
 _LAST_CHUNK_S = 1.0
-"""The last chunk has so long to go out."""
+"""Time that the last chunk has to leave."""
 _MEASURED_NS, _OLD_NS = SECOND_NS, 5 * SECOND_NS
-"""How often a disk is asked for its free space, and how long its answer counts."""
+"""How often the disk's free space is measured, and how long a measurement counts."""
 _TRICKLE_SHARE = 1 / 40
-"""Share of the total that is the backlog's own: what takes all the rest must not keep it waiting for ever."""
+"""Share of the total that belongs to the backlog, so that other traffic cannot keep it waiting for ever."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkAllowance:
-    """The limits of a chunk now."""
+    """The limit of a chunk that is sent now."""
 
     limit_bytes: int
     trickle: bool = False
-    """There is no room: a little goes all the same, with pauses."""
+    """The budget has no room: small chunks are sent all the same, with pauses."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoreNumbers:
-    """The contents and the counts of the store."""
+    """The contents and counters of the store."""
 
     stills: int = 0
     segments: int = 0
-    """Stretches of video, the one that is being written included."""
+    """Stretches of video, including the one that is being written."""
     video_s: float = 0.0
     disk_bytes: int = 0
     sent_stills: int = 0
@@ -195,7 +195,7 @@ class StoreNumbers:
     unreadable: int = 0
     given_up: int = 0
     unacknowledged_bytes: int = 0
-    """Sent, and not in any report of a ground yet."""
+    """Bytes sent that no report of a ground names yet."""
 
     @property
     def empty(self) -> bool:
@@ -203,10 +203,10 @@ class StoreNumbers:
 
 
 class StoreWorker:
-    """Stores, sends, and leaves the store in order; everything on disk runs in its thread.
+    """Stores, sends, and closes the store; all disk access runs in its thread.
 
-    Whatever storing or sending raises goes to ``failures``, and is tried again.
-    ``on_sent(entry)`` is called for each object that a ground has whole. `close` waits ``close_s`` for the disk.
+    Any error of storing or sending goes to ``failures``, and the work is tried again.
+    ``on_sent(entry)`` is called for each object that a ground has completely. `close` waits ``close_s`` for the disk.
     """
 
     def __init__(
@@ -233,16 +233,16 @@ class StoreWorker:
         self._close_s = close_s
         self._backfill = Backfill(store, session_id=session_id, on_done=self._note_done)
         self.intake = Intake(_QUEUE)
-        """For signals, see there; objects to store come by `offer`."""
+        """Takes signals directly; objects to store come by `offer`."""
         self._sending = ChunkThread(send, on_done=self.intake.signal)
         self._sent_stills = self._sent_ns = self._trickle_ns = 0
         self._slow = False
         self._free: tuple[int, int | None] | None = None
-        """When the disk's free bytes were measured, and how many."""
+        """When the disk's free bytes were measured, and their number."""
         self._too_large = 0
         self._retry, self._sending_retry = RetryPause(), RetryPause()
         self.failed = False
-        """The disk refuses: nothing is stored until it takes something again."""
+        """The disk refuses: nothing is stored until a trial write succeeds."""
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="hvt-store", daemon=True)
         self._thread.start()
@@ -256,7 +256,7 @@ class StoreWorker:
             raise error
 
     def offer(self, item: AccessUnit | IntakeStill) -> bool:
-        """Hand over something to be stored; False where the disk is too slow or refuses, or it is too large."""
+        """Queue an item to be stored; False where the disk is too slow or refuses, or the item is too large."""
         self.check()
         if self.failed:
             return False
@@ -295,16 +295,16 @@ class StoreWorker:
 
     @property
     def disk_free_bytes(self) -> int | None:
-        """Of the disk that the store lies on; None where it does not answer."""
+        """Free bytes of the store's disk; None where it does not answer."""
         free = self._free
         return free[1] if free is not None and self._clock() - free[0] < _OLD_NS else None
 
     def send_no_more(self) -> None:
-        """Send nothing from now on, so that an account can be closed; new objects are still stored."""
+        """Send no chunk from now on, so that the counts can be final; new objects are still stored."""
         self._sending.close(_LAST_CHUNK_S)
 
     def close(self) -> None:
-        """Write the queue, end the file, join the thread. A disk that hangs costs the queue, and a warning."""
+        """Write the queue, close the file, join the thread. A disk that hangs costs the queue, and a warning."""
         self.intake.signal(closed=True)
         self._thread.join(timeout=self._close_s)
         if self._thread.is_alive():
@@ -333,7 +333,7 @@ class StoreWorker:
             self._error = error
 
     def _turn(self) -> None:
-        # Here alone: a disk that hangs would hold up the frame loop, and live video with it.
+        # Only in this thread: a disk that hangs would hold up the frame loop, and live video with it.
         if self._free is None or self._clock() - self._free[0] >= _MEASURED_NS:
             self._free = self._clock(), _free_bytes(self._store.path)
         busy = self._store.stills or self._store.segments
@@ -351,12 +351,12 @@ class StoreWorker:
             self._attempt(self._store.end_segment)
 
     def _attempt(self, do: Callable[[], None]) -> bool:
-        # Whether it was done; else nothing is stored until a trial succeeds.
+        # Returns whether it succeeded; after a failure nothing is stored until a trial succeeds.
         try:
             do()
         except OSError as error:
             self._fail(f"--store-folder {error.filename or ''}: {error.strerror or error}")
-        except Exception as error:  # noqa: BLE001 - it stops storing, never the flight
+        except Exception as error:  # noqa: BLE001 - a failure stops storing, never the flight
             _log.debug("storing failed", exc_info=error)
             self._fail(f"storing stopped ({reason_of(error)})")
         else:
@@ -374,7 +374,7 @@ class StoreWorker:
             do()
         except OSError as error:
             self._fail(f"--store-folder {error.filename or ''}: {error.strerror or error}")
-        except Exception as error:  # noqa: BLE001 - it stops sending, never storing nor the flight
+        except Exception as error:  # noqa: BLE001 - a failure stops sending, never storing nor the flight
             _log.debug("sending what was stored failed", exc_info=error)
             self._backfill.put_aside()
             self._sending_retry.failed(self._clock())
@@ -397,7 +397,7 @@ class StoreWorker:
     def _send_chunk(self) -> None:
         done = self._sending.take()
         if done is not None and not done[1]:
-            self._backfill.take_back(done[0])  # and wait a moment: others send
+            self._backfill.take_back(done[0])  # and wait a moment: other messages are being sent
             return
         now_ns = self._clock()
         if done is not None:
@@ -420,7 +420,7 @@ class StoreWorker:
 
 
 def _free_bytes(folder: Path) -> int | None:
-    # Where it will be, before it is made.
+    # The folder may not exist yet: its nearest existing parent answers.
     for path in (folder, *folder.parents):
         try:
             return shutil.disk_usage(path).free
@@ -434,8 +434,8 @@ def _free_bytes(folder: Path) -> int | None:
 class ChunkThread:
     """Sends one chunk at a time in a thread of its own: a link that is full for seconds must not hold up the disk.
 
-    `put`, `take` and `ready` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)``
-    returns the line bytes, 0 where it was not sent; it may block.
+    `put`, `take` and `ready` are for one thread; ``on_done()`` is called in the sending thread after each chunk.
+    ``send(chunk)`` returns the line bytes, 0 where it was not sent; it may block.
     """
 
     def __init__(self, send: Callable[[Chunk], int], *, on_done: Callable[[], None]) -> None:
@@ -449,16 +449,16 @@ class ChunkThread:
 
     @property
     def ready(self) -> bool:
-        """Whether it sends another: none is being sent, or was sent and not taken note of."""
+        """Whether it takes another chunk: none is being sent, and `take` has returned the last one."""
         return not (self._busy or self._closed)
 
     def put(self, chunk: Chunk) -> None:
-        """Send this; only where it is `ready`."""
+        """Send this chunk; only while it is `ready`."""
         self._busy = True
         self._chunks.put(chunk)
 
     def take(self) -> tuple[Chunk, int] | None:
-        """The chunk sent last and its line bytes, once; None until then. Raises whatever ``send`` has raised."""
+        """The chunk sent last and its line bytes, once; None until it was sent. Raises the error of ``send``."""
         if self._done.empty():
             return None
         chunk, sent = self._done.get()
@@ -468,7 +468,7 @@ class ChunkThread:
         return chunk, sent
 
     def close(self, timeout_s: float) -> None:
-        """Send no more, and count the queue as not sent; the chunk under way has so long to go."""
+        """Send no more, and count the queue as not sent; the chunk under way has ``timeout_s`` to leave."""
         self._closed = True
         self._chunks.put(None)
         self._thread.join(timeout=timeout_s)
