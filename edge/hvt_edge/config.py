@@ -25,7 +25,7 @@ from hvt_common.config import (
     or_auto,
 )
 from hvt_common.errors import UserError
-from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import parse_tiles

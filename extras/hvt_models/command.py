@@ -13,7 +13,7 @@ from rich.table import Table
 
 from hvt_common import __version__
 from hvt_common.errors import Parser, UserError, exit_with_sentence
-from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.runtimes.plug_in import plug_in_names
 from hvt_common.inference.store import (
     EMBEDDED_CLASSIFIER,

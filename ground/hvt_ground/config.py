@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import UserError, check_apart
-from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, parts_of
 from hvt_common.protocol.channels import GroupKeys

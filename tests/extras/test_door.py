@@ -12,7 +12,7 @@ import hvt_edge.cli
 from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, open_detector
-from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.store import library_part
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.plug_ins import health_server

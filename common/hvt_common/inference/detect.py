@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of
-from hvt_common.inference.heads.choose import HEAD_NAMES, Trial, check_head_name, choose_head, trial_pictures
+from hvt_common.inference.heads import HEAD_NAMES
+from hvt_common.inference.heads.choose import Trial, check_head_name, choose_head, trial_pictures
 from hvt_common.inference.heads.contract import is_like
 from hvt_common.inference.labels import (
     USUAL_CONFIDENCE,
@@ -96,7 +97,7 @@ def open_detector(
     """Open a detector: ``motion``, the name of a model (see `resolve_model`), a file, a plug-in's name, or ``A+B``.
 
     ``labels`` are class names, see `read_labels`; else those of the metadata, or "class 0" and so on, which is said.
-    ``head`` is one of `heads.choose.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
+    ``head`` is one of `heads.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
     of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
     hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). ``confidence`` of a plug-in is applied to

@@ -16,7 +16,7 @@ import numpy as np
 from hvt_common.errors import UserError, check_not_read
 from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import Detector, open_detector
-from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.labels import default_confidence
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import tiled

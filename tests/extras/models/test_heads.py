@@ -13,7 +13,7 @@ from onnx import TensorProto, helper
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, open_detector
-from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.runtimes.model import OnnxModel, Port, open_model
 from hvt_common.inference.runtimes.providers import ProviderChoice
 from media.head_models import FAMILIES, NEEDS_NAMES, SQUARES, Graph, family_model, picture

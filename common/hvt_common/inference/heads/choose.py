@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.heads.contract import (
     MOST_RELATIVE,
     Array,
@@ -242,28 +243,6 @@ def _yolox(trial: Trial) -> Match | None:
 
 
 YOLOX = Kind("YOLOX, raw: (1, A, 5+C)", _yolox, "top-left", BGR_255)
-
-HEAD_NAMES = (
-    "yolox",
-    "yolox-decoded",
-    "yolov5",
-    "yolov6",
-    "yolov8",
-    "yolov8-rows",
-    "end-to-end",
-    "yolov7-rows",
-    "yolo-nas",
-    "nas-rows",
-    "nms-lists",
-    "rt-detr",
-    "rt-detr-rows",
-    "rf-detr",
-    "labels-boxes-scores",
-    "ssd",
-    "atss",
-    "tf-lists",
-)
-"""The values of ``--head``; all but the first are of the model library, and ``--help`` is not to load it."""
 _RT_DETR = ("rt-detr-rows", "rt-detr")
 _RAW_AXES = 5
 """(1, 3, H, W, 5+C): YOLOv5's levels, beside all of them decoded."""
