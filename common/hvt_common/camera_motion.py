@@ -22,7 +22,7 @@ _USUAL_TIMES: Final = 1.3
 _EXPOSURE: Final = 16.0
 """Levels. By so much the whole picture may become brighter or darker from one step to the next."""
 _NEWEST: Final = 4
-"""So many differences tell what is usual: of a source that repeats pictures some are none."""
+"""The usual difference is the largest of this many: a source that repeats pictures has differences of 0 between."""
 _SCENE_LEVELS: Final = 4.0
 """Two scenes of less mean difference are a keyframe's sharper picture of the same water or fog."""
 
@@ -116,7 +116,7 @@ class CameraMotion:
         self._marked, self._since = self._previous, np.eye(3)
 
     def still(self) -> bool:
-        """Whether the newest image shows what the marked one did, but for a small motion of the camera. 0.2 ms."""
+        """Whether the newest image shows the same as the marked one, but for a small motion of the camera. 0.2 ms."""
         then, now = self._marked, self._previous
         if then is None or now is None or then.shape != now.shape or self.shift() > _STILL_SHIFT:
             return False
@@ -126,7 +126,7 @@ class CameraMotion:
         return changed <= _STILL_CHANGED * now.size
 
     def shift(self) -> float:
-        """How far the newest image lies from the marked one, of the picture's sides together: what came into view."""
+        """The shift from the marked image to the newest, as a share of the sides: how much came into view."""
         height, width = (1, 1) if self._previous is None else self._previous.shape
         corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
         moved = np.abs(corners @ self._since[:2].T - corners[:, :2]).max(axis=0) / (width, height)

@@ -2,8 +2,8 @@
 
 A field is declared by its `Group`: its kind (how text becomes a value and back) and its help.
 Every value passes through its kind whether it comes from the file or from the command line, so both say the
-same sentence when it is wrong. ``--help`` leaves out what is ``rare``; ``--help-all`` lists everything. A class
-may name in ``GONE`` what it does not take (any more): name → the end of the sentence, with what to do in its place.
+same sentence when it is wrong. ``--help`` leaves out ``rare`` settings; ``--help-all`` lists all. A class may
+name settings in ``GONE`` that it does not take (any more): name → the end of the sentence, with the replacement.
 ``USUAL`` of a class: name → value that a start without flags has in place of the default, and the flags that undo it.
 """
 
@@ -147,8 +147,8 @@ class Group:
     ) -> Any:
         """Declare a dataclass field that is also a flag ``--its-name`` and a TOML key ``its-name``.
 
-        With ``many`` the flag may be given several times and the value is a tuple; ``bare`` is what the flag means
-        where no value is given.
+        With ``many`` the flag may be given several times and the value is a tuple; ``bare`` is the value of the
+        flag alone.
         """
         more = {"kind": kind, "many": many, "shown_default": shown_default, "bare": bare}
         return self._field(default, help_line, more)

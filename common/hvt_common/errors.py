@@ -32,14 +32,14 @@ _NO_MORE = (errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _NO_MORE_WORDS = ("can't start new thread", "failed to map segment from shared object")
 """Of Python's errors without a number."""
 FOREIGN = (Exception, SystemExit)
-"""What code of others raises: much of it calls `sys.exit` where something is wrong."""
+"""Exceptions of foreign code: much of it calls `sys.exit` after a fault."""
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 class UserError(Exception):
     """Something the user can mend: one sentence that names the thing, its value and the accepted ones.
 
-    Command-line tools print it without a traceback and exit with code 2. Raise it only for what comes from
+    Command-line tools print it without a traceback and exit with code 2. Raise it only for faults from
     outside (arguments, files, the machine); a wrong value between our own functions is a bug and crashes
     loudly.
     """
@@ -142,7 +142,7 @@ def _number(kind: type[float], accepted: str) -> Callable[[str], float]:
 def check_not_read(path: Path, reads: Iterable[Path], *, name: str) -> None:
     """Raise `UserError` where ``path``, which is to be written, is one of the files that are ``reads``, by any name.
 
-    Links count, symbolic and hard ones: what is read would be gone.
+    Links count, symbolic and hard ones: the file to read would be lost.
     """
     for one in reads:
         try:
@@ -155,7 +155,7 @@ def check_not_read(path: Path, reads: Iterable[Path], *, name: str) -> None:
 
 @contextmanager
 def telling(what: str, rest: str = "") -> Iterator[None]:
-    """Of an `OSError` make a `UserError`: ``what``, the system's reason, and the ``rest`` of the sentence."""
+    """Turn an `OSError` into a `UserError`: ``what``, the system's reason, and the ``rest`` of the sentence."""
     try:
         yield
     except OSError as error:
@@ -217,7 +217,7 @@ def exit_with_sentence(
 
 
 def _used_up(error: Exception) -> str:
-    # What the machine has no more of; empty where that is not the reason.
+    # The resource that the machine has run out of; empty where that is not the reason.
     number = error.errno if isinstance(error, OSError) else None
     reason = str(getattr(error, "strerror", None) or error) or type(error).__name__
     if number in _FULL:

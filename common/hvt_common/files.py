@@ -18,7 +18,7 @@ MOST_BYTES = 16_000_000
 MOST_TABLE_BYTES = 1_000_000_000
 """Of labels and annotations of a whole dataset."""
 PIPE_WAIT_S = 10.0
-"""So long a pipe's other end is waited for, and what comes through it."""
+"""The longest wait for a pipe's other end, and then for its content."""
 
 
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
@@ -74,7 +74,7 @@ def decoded(content: bytes) -> str:
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file whole or not at all, through a link to where it leads; another process may do so, too.
 
-    A pipe or a device takes the bytes as they come, and so does standard output: what was printed stays before them.
+    A pipe, a device or standard output takes the bytes as they come, after everything printed before.
     Raises `OSError`.
     """
     if _is_output(path):

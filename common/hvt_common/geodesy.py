@@ -44,7 +44,7 @@ def moved(latitude_deg: float, longitude_deg: float, *, north_m: float, east_m: 
 def between(first: Pose, second: Pose, capture_ns: int) -> Pose:
     """The pose at a time on the line through two, also before or behind them; ``first`` is the earlier one.
 
-    What only one of them knows is missing. The angles turn the shorter way. Errors are those of the worse.
+    A value that only one of them knows is missing. Angles turn the shorter way. Errors are those of the worse pose.
     """
     share = (capture_ns - first.capture_ns) / max(1, second.capture_ns - first.capture_ns)
 

@@ -1,4 +1,4 @@
-"""Keeps the secrets of addresses in memory: what is printed, logged, written or sent of one goes through here. Pure.
+"""Hides the secrets of addresses: all text that is printed, logged, written or sent goes through here. Pure.
 
 Of an address scheme, host and port are shown, and the words of its path that cameras use. A password, a token or a
 stream key may stand in its user, its query, its path or its fragment, and may look like any other word; an address
@@ -35,7 +35,7 @@ webm wide x zoom
 """Words in the paths that cameras, gimbals and media servers give their streams."""
 _MOST_DIGITS, _MOST_DIGITS_TOGETHER = 6, 4
 _PLAIN = re.compile(r"[A-Z]?[a-z]{0,12}[0-9]{0,4}", re.ASCII)
-"""What is hidden in its address alone: a word that may stand anywhere else, such as in the name of an edge."""
+"""A word that is hidden in its address alone, as it may stand anywhere else, such as in the name of an edge."""
 _SEPARATOR = re.compile(r"[/?#\\]")
 _HOSTLIKE = r"(?:\[|localhost|(?:\d{1,3}\.){3}\d|[^/]*:\d)"
 _BEGIN = re.compile(
@@ -59,7 +59,7 @@ _ANYWHERE = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}:[/\\]{1,4})(?:[^\n]*@|[^\
 def redacted(address: str) -> str:
     """An address as it may be shown, such as ``rtsp://…@10.0.0.5/stream1?…``; the path of a file stays as it is.
 
-    Where it cannot be told what is the host, as with a ``#`` in a password, nothing but the scheme is shown.
+    Where the host cannot be told from the rest, as with a ``#`` in a password, nothing but the scheme is shown.
     """
     found = _SCHEME.match(address)
     if found is None:
@@ -151,7 +151,7 @@ def _secrets(word: str) -> Iterable[str]:
         name, colon, password = user.partition(":")
         yield from (user, password if colon else name)
     yield from (value for _, value in _PAIR.findall(body))
-    # A library may take it apart at any of these; what of an address is shown need not be hidden.
+    # A library may split the address at any of these; the shown parts need not be hidden.
     shown = redacted(word)
     for part in re.split(r"[/?#&;@\[\]\\]", body):
         for one in (part, *part.split("=", 1)[1:], *part.split(":")):

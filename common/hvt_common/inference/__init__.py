@@ -4,6 +4,6 @@
 `scale_search` finds the scale at which one promises most objects. `labels` also reads whether a model's scores
 are calibrated.
 
-`letterbox` makes of an image what a network sees. The room `runtimes` runs a network, `heads` tells
-what its outputs mean, `store` gives paths of models; the extra `hvt_models` knows more models and merges several.
+`letterbox` prepares an image as a network's input. The room `runtimes` runs a network, `heads` decodes
+its outputs, `store` gives paths of models; the extra `hvt_models` knows more models and merges several.
 """

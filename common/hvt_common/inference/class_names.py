@@ -5,8 +5,8 @@ A *kind* is the word in which classes of different models are compared: ``car``,
 motion detector's only class, ``moving``, may be any kind and passes every class list. A name that is not in the table
 is a kind of its own.
 
-A *group* is coarser: ``vehicle``, ``person``, ``boat``, ``animal`` (``names/groups.toml``). It is what a classifier
-of photographs can say of an object: ``names/imagenet_groups.txt`` has the group of each synset of ImageNet.
+A *group* is coarser: ``vehicle``, ``person``, ``boat``, ``animal`` (``names/groups.toml``). A classifier
+of photographs can tell groups apart: ``names/imagenet_groups.txt`` has the group of each synset of ImageNet.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def group_of(name: str) -> str | None:
 
 
 def are_apart(name: str, other: str) -> bool:
-    """Whether they mean two groups: a person is no vehicle, but may be what moves."""
+    """Whether they mean two groups: a person is no vehicle, but may be ``moving``."""
     groups = {group_of(name), group_of(other)}
     return len(groups) == 2 and None not in groups
 

@@ -344,7 +344,7 @@ class OnnxDetector:
             except UserError:
                 if not runs:
                     raise
-                continue  # what fails on some pictures alone fails in flight, and is opened again
+                continue  # a network that fails on some pictures only is opened again in flight
             # Half precision may overflow where the range of the pixels is not the network's.
             if not top or all(_is_finite(output) for output in outputs):
                 runs.append(outputs)

@@ -50,8 +50,8 @@ _OF_TABLE = re.compile(r"[\[\]{}]|:$|^names\s*:")
 def read_labels(path: Path) -> tuple[str, ...]:
     """Read class names: UTF-8 text, one name a line, the first line is class 0; or one of `KNOWN_LABELS`.
 
-    Blank lines at the end are ignored; spaces around a name too, and what numbers every line: 0 or 1 and so on, or a
-    synset of ImageNet. A name may occur twice (ImageNet has two cranes). Raises `UserError` where it is missing, not
+    Blank lines at the end are ignored, so are spaces around a name and numbers before every name (0 or 1 and on, or
+    a synset of ImageNet). A name may occur twice (ImageNet: crane). Raises `UserError` where it is missing, not
     readable, not text, empty or a table, has a blank line in the middle, or too many or too long names.
     """
     if str(path) in KNOWN_LABELS and not path.exists():
@@ -82,7 +82,7 @@ def read_labels(path: Path) -> tuple[str, ...]:
 
 
 def _without_numbers(names: Sequence[str]) -> tuple[str, ...]:
-    # ``0 car``, ``1: bus`` in any order, ``- car``, ``"car"`` or ``n02084071 dog``: what marks every line is no name.
+    # ``0 car``, ``1: bus`` in any order, ``- car``, ``"car"`` or ``n02084071 dog``: a mark of every line is no name.
     if all(map(_MARKED.fullmatch, names)):
         return tuple(_MARKED.sub(r"\2", name) for name in names)
     if all(map(_SYNSET.match, names)):
@@ -151,7 +151,7 @@ def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
     """Class names that a model carries in ``names``, as Ultralytics writes it, or ``classes``.
 
     Each may be a list or a table by number (``{0: 'car', 1: 'bus'}``), as a Python literal, which is read without
-    executing anything, or as JSON; or names between commas or line ends. What is malformed counts as none.
+    executing anything, or as JSON; or names between commas or line ends. Malformed text counts as none.
     """
     found = (_written_names(metadata.get(key, "")) for key in ("names", "classes"))
     return next((names for names in found if names is not None), None)
@@ -215,7 +215,7 @@ def _names(value: object) -> tuple[str, ...] | None:
         return None
     if any(isinstance(item, dict | list | tuple) for item in value):
         return None
-    # What no terminal, table or message can hold is ``?``.
+    # ``?`` stands for characters that no terminal, table or message can hold.
     plain = (shown_text(str(item)[:MAX_LABEL_CHARS]).replace("\n", "?") for item in value)
     return tuple(name or f"class {number}" for number, name in enumerate(plain))
 

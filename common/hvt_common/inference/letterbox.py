@@ -17,7 +17,7 @@ from hvt_common.values import Boxes, Image
 
 @dataclass(frozen=True, slots=True)
 class OwnSteps:
-    """What a network does to its pixels itself."""
+    """The preparation of pixels in the network's own graph."""
 
     top: int | None = None
     """The greatest pixel that it scales, 1 or 255; None where it scales none."""
@@ -42,7 +42,7 @@ class Preparation:
         return cls(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 / 57.12, 1 / 57.375))
 
     def beside(self, own: OwnSteps) -> Preparation:
-        """What is left to do for a network that does these steps itself."""
+        """The remaining preparation for a network that does these steps itself."""
         rgb = (self.rgb if own.rgb is None else own.rgb) != own.turned
         if own.top is not None:
             return Preparation((0.0,) * 3, (own.top / 255,) * 3, rgb=rgb)
@@ -154,8 +154,8 @@ class Letterbox:
 class Letterboxer:
     """Writes images into one reused network input; nothing is allocated while the geometry stays the same.
 
-    ``anchor`` is where the image lies, ``preparation`` what the network sees of a pixel, as float32, float16 or,
-    where it is the pixel itself, uint8.
+    ``anchor`` is the place of the image, ``preparation`` the network's value of a pixel, as float32, float16 or, for
+    the pixel itself, uint8.
     """
 
     def __init__(

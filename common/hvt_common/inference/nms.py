@@ -49,7 +49,7 @@ def suppress(
     apart = rects.copy()
     apart[:, :2] += class_ids[best, None] * span
     count, selected = 0, np.empty(0, np.intp)
-    while len(selected) < limit and count < len(best):  # no box changes what better ones become
+    while len(selected) < limit and count < len(best):  # no box changes the choice of better ones
         count = 2 * max(count, limit)
         selected = _greedy(apart[:count], iou)
         if any_class_iou < 1:
@@ -66,7 +66,7 @@ def averaged(
     iou: float,
     second: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[Boxes, npt.NDArray[np.float32]]:
-    """(K, 4) boxes and (K,) scores of the ``selected``, by what overlaps each of them of its class.
+    """(K, 4) boxes and (K,) scores of the ``selected``, averaged over the overlapping candidates of the same class.
 
     A box is the mean by scores of those that overlap it by `_ALIKE`, or by ``iou`` where neighbours that overlap so
     much stay two: a network says an object from several cells, the surest box is not the best on each of its sides,

@@ -1,10 +1,10 @@
 """The scales at which a detector promises most objects, found in flight.
 
-Of cars of five pixels a network that learnt them at twenty says next to nothing, and of the same picture enlarged
-nearly all. So now and then one quarter of the picture is looked at enlarged too. Where that promises far more objects
-(the sum of calibrated confidences is the expected number of true ones), the whole is looked at so from then on, part
-by part, until it promises no more than the whole alone. And where few objects are sure, each third picture is looked
-at reduced too, each one while there is something large: a network overlooks what fills a third of the picture. See
+A network that learnt cars at twenty pixels finds hardly one of five pixels, and nearly all in the same picture
+enlarged. So now and then it also searches one quarter of the picture enlarged. Where that promises far more objects
+(the sum of calibrated confidences is the expected number of true ones), the whole picture is searched so from then
+on, part by part, until it promises no more than one run. And where few objects are sure, each third picture is
+searched reduced too, or each one while it shows a large object: a network overlooks one that fills a third. See
 docs/embedded-models.md.
 """
 
@@ -25,17 +25,17 @@ from hvt_common.values import Detections, Image
 _log = logging.getLogger(__name__)
 _GRID: Final = (2, 2)
 _OVERLAP: Final = 0.05
-"""Of two neighbouring parts: what is looked at enlarged is small."""
+"""Of two neighbouring parts: objects in enlarged parts are small."""
 _MOST_SIDE: Final = 1280
 """A larger picture is searched at the scale of its pixels already (`hvt_common.inference.tiles`)."""
 _FIRST, _EVERY = 3, 45
-"""The first so many pictures are probed, and every so manieth from there on."""
+"""The first 3 pictures are probed, then every 45th."""
 _OTHER: Final = 2.0
 """Twice or half as many promised as at the last probe: another scene, which is probed at once."""
 _MORE, _LEAST_MORE = 3.0, 8.0
 """The part must promise so many times as much enlarged, and so many objects more."""
 _SEEN_WHOLE_PX: Final = 80
-"""What is so long in the picture its one run sees; a part alone, enlarged, sees a bus in a crossing's stripes."""
+"""The whole picture's run sees objects from this length on; an enlarged part sees a bus in a crossing's stripes."""
 _STILL_MORE: Final = 2.0
 _IN_VAIN: Final = 3
 """So many pictures in a row that promise less than `_STILL_MORE` times as much end it."""
@@ -68,7 +68,7 @@ class ScaleSearch:
         return frames * _RARER if self.enlarged else frames
 
     def take(self, whole: Detections, image_bgr: Image) -> Detections:
-        """All that is found on the next picture, ``whole`` being what its one run has found."""
+        """All objects of the next picture; ``whole`` are those of its one run."""
         size = (image_bgr.shape[1], image_bgr.shape[0])
         self._pictures += 1
         whole = self._with_large(whole, image_bgr)

@@ -1,7 +1,7 @@
-"""From what the user wrote after ``--detector`` or ``--classifier`` to files: embedded, of the library, or plain.
+"""From the value of ``--detector`` or ``--classifier`` to files: embedded, of the library, or plain.
 
 The embedded models come with the package: trained in this repository, Apache-2.0; see ``docs/models.md``. The model
-library is an extra: what the entry points of the group ``hvt.models`` name.
+library is an extra: the entry points of the group ``hvt.models``.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def library_part(name: str) -> Any | None:
 
 
 def needed_part(name: str, what: str) -> Any:
-    """As `library_part`; `UserError` where it is not installed, which says ``what`` needs it."""
+    """As `library_part`; `UserError` where it is not installed: the sentence says that ``what`` needs it."""
     part = library_part(name)
     if part is None:
         raise UserError(f"{what} is not available: {MISSING}")
@@ -109,7 +109,7 @@ def parts_of(spec: str) -> tuple[str, ...]:
 def resolve_model(spec: str, *, role: str = "model", words: Sequence[str] = ()) -> Path:
     """The file of a model that is named or that is a file already; a model of the cache is checked first.
 
-    ``spec`` is a name, or a path: what has a folder or a suffix in it. The sentence of an error calls it ``role``
+    ``spec`` is a name, or a path if it has a folder or a suffix in it. The sentence of an error calls it ``role``
     and lists ``words`` too. Raises `UserError` where there is nothing of that name; for a model that could be had,
     with the command that fetches it and the way to bring it by hand.
     """

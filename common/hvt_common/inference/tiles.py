@@ -50,7 +50,7 @@ _REDUCED_SIDE: Final = 256
 """The longer one of a reduced picture, in pixels …"""
 _LEAST_REDUCED: Final = 0.6
 _LARGE_PX: Final = 24
-"""… and that of what counts as large in it. With 32 a tenth of thermal cars is missed."""
+"""… and the least side of a large object in it. With 32 a tenth of thermal cars is missed."""
 _SURE: Final = 0.5
 _PART: Final = 0.02
 """Of a vehicle's box; a person seen from above is a thirtieth."""
@@ -185,7 +185,7 @@ class TiledDetector:
 def with_tiles(
     whole: Detections, image_bgr: Image, tiles: Iterable[Tile], detect: Callable[[Image], Detections]
 ) -> Detections:
-    """What was found in the whole picture and what ``detect`` finds in each of its tiles, as one list, best first."""
+    """Objects found in the whole picture and those of ``detect`` in each of its tiles, as one list, best first."""
     size = (image_bgr.shape[1], image_bgr.shape[0])
     parts, truncated = [whole], [np.zeros(len(whole), bool)]
     for tile in tiles:
@@ -198,10 +198,10 @@ def with_tiles(
 
 
 def with_large(whole: Detections, image_bgr: Image, detect: Callable[[Image], Detections]) -> Detections:
-    """What was found in the whole picture and what is large of what ``detect`` finds in it reduced, as one list.
+    """The objects found in the whole picture and the large ones of ``detect`` in it reduced, as one list.
 
-    Where a vehicle fills much of the picture a network that learnt them at twenty pixels sees its mirror, a
-    pedestrian. Reduced it sees the vehicle, and what is a part of it is left out.
+    Where a vehicle fills much of the picture, a network that learnt vehicles at twenty pixels takes its mirror for a
+    pedestrian. In the reduced picture it sees the vehicle; parts of that are left out.
     """
     scale = _REDUCED_SIDE / max(image_bgr.shape[:2])
     if scale > _LEAST_REDUCED:

@@ -1,8 +1,8 @@
 """Says once in a run that the detector does not know the view.
 
 How far a view can be trusted is measured by the mean calibrated confidence of its boxes, weak ones among them: where
-nothing is as the network knows it, most of what it finds is weak. Of ten measures it ranks views by their precision
-best (docs/embedded-models.md). It costs no run.
+the view is unlike the training pictures, most boxes are weak. Of ten measures it ranks views by precision best
+(docs/embedded-models.md). It costs no run.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def trust_from(detector: str) -> float | None:
 class ViewTrust:
     """Of one video. Boxes count from a confidence of ``counts_from``; None trusts every view.
 
-    ``unlike`` holds while the view is unlike what the detector knows; that is said once, with ``hence``, what follows
-    from it. ``mean`` is the mean confidence of the boxes that count, None before there were enough. From any thread.
+    ``unlike`` holds while the detector does not know the view; that is said once, with the consequence ``hence``.
+    ``mean`` is the mean confidence of the boxes that count, None before there were enough. From any thread.
     """
 
     def __init__(self, counts_from: float | None, *, hence: str) -> None:
@@ -49,7 +49,7 @@ class ViewTrust:
         self.mean: float | None = None
 
     def take(self, found: Detections) -> None:
-        """Count what was found on the next picture."""
+        """Count the detections of the next picture."""
         if self._counts_from is None:
             return
         counted = found.confidences[found.confidences >= self._counts_from]

@@ -1,4 +1,4 @@
 """HVT as bytes, without Zenoh: `channels` (the key table), `messages`, `ledger`, `clock_offset`.
 
-What an edge does has its words in `edge_words`: frames, stills, failed parts, auto's decisions.
+`edge_words` has the texts for an edge's frames, stills, failed parts and decisions of auto.
 """

@@ -80,9 +80,9 @@ class ClockOffset:
 class CaptureClock:
     """The times of one camera by this ground's clock.
 
-    A camera's clock may be years off, and an edge may say what it likes. A picture that came long before it was
-    captured, or a minute after, counts from its arrival, and so do those after it, as long as that can be. One that
-    came a little before shows by how much, at least, an exchange in a queue is wrong.
+    A camera's clock may be years off, and an edge may report any time. A picture that arrived long before its capture
+    time, or a minute after it, is timed by its arrival; so are the next ones while that stays possible. A picture
+    that arrived a little before its capture time shows the least error of a clock exchange that waited in a queue.
     """
 
     def __init__(self, edge_clock: ClockOffset) -> None:
@@ -99,7 +99,7 @@ class CaptureClock:
             most_ns = offset_ns + error_ns
             before_ns = self._least_offset_ns - _drift_ns(received_ns - self._noted_ns)
             least_ns = min(capture_ns - received_ns, most_ns)
-            # What an exchange has shown to be impossible since is of a clock that was set.
+            # An exchange has shown this bound to be impossible: the clock was set since.
             self._least_offset_ns = max(least_ns, before_ns) if before_ns <= most_ns else least_ns
             self._noted_ns = received_ns
         elif self.is_sound or not 0 <= received_ns - self.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:

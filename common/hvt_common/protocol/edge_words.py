@@ -1,4 +1,4 @@
-"""Texts for the words of an edge: reasons and outcomes of stills and frames, failed parts, and what auto sends.
+"""Texts for the words of an edge: reasons and outcomes of stills and frames, failed parts, decisions of auto.
 
 `Status`, JSON and metrics have the words of the code.
 """
@@ -34,7 +34,7 @@ STILL_WORDS: Mapping[str, str] = MappingProxyType(
         "too_large": "too large for the budget",
         "stale": "waited too long",
         "ended": "came too late: the flight ended",
-        # What the ground made of it.
+        # The outcome at the ground.
         "matched": "named a track",
         "superseded": "older than what named the track",
         "no track": "matched no track",
@@ -111,7 +111,7 @@ def lever_decisions(says: str) -> list[tuple[str, str]]:
 
 
 def lever_sentences(says: str) -> list[str]:
-    """The same for people; what a later version decides is said as it is."""
+    """The same as sentences for people; a decision of a later version is shown by its own word."""
     sentences = []
     for decision, why in lever_decisions(says):
         begins = LEVER_WORDS.get(decision, f"{decision[:1].upper()}{decision[1:]}")

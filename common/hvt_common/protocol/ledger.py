@@ -74,8 +74,8 @@ def overhead_bytes(
 
     ``key`` is the whole key: to a subscriber with a wildcard Zenoh sends it in full each time. ``encoding`` is the
     encoding's name, empty for Zenoh's default. A ``reply`` is the only one to its query. Headers below IP (14 bytes a
-    packet on Ethernet), acknowledgements and retransmissions are not in it, nor what is saved where Zenoh sends two
-    messages in one batch.
+    packet on Ethernet), acknowledgements and retransmissions are not in it, nor the bytes saved where Zenoh sends
+    two messages in one batch.
     """
     framing = _FRAMING_BYTES + len(key) + _varint_bytes(payload_bytes)
     if attachment_bytes:

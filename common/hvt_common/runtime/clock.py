@@ -83,7 +83,7 @@ def unwitnessed_ns(before: Moment, now: Moment, *, most_ns: int) -> int:
     """By how much Unix time has moved from ``before`` to ``now`` beyond the time that is known to have passed.
 
     Within a boot that time is known. Over a boot nobody knows it: the clock of a machine without a battery stood
-    still, and a clock that was set says nothing of how it was before. Then what it says counts up to ``most_ns``.
+    still, and a clock that was set tells nothing of its former error. Then the difference counts up to ``most_ns``.
     """
     moved_ns = now.unix_ns - before.unix_ns
     if now.boot == before.boot:

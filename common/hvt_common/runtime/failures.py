@@ -24,7 +24,7 @@ _STEADY_NS = 60 * SECOND_NS
 SILENT_NS = 10 * SECOND_NS
 """The slowest network answers sooner."""
 _STEADY_PAUSES = 10
-"""What has worked for so many first pauses is tried again after the first one: that costs little."""
+"""A part that worked for this many first pauses is retried after the first pause again: that costs little."""
 
 
 def reason_of(error: BaseException) -> str:
@@ -73,7 +73,7 @@ class Failures:
         self._watched = WeakSet[Turns]()
 
     def watch(self, part: Turns) -> None:
-        """Ask it before each look at what fails now whether it hangs, for as long as it is there."""
+        """Ask the part whether it hangs before each listing of failures, for as long as it exists."""
         with self._lock:
             self._watched.add(part)
 
@@ -211,9 +211,9 @@ class Turns:
 
 
 class Retried(Generic[_Part]):
-    """A part that may raise whatever it likes: it is opened again after a pause. Threads take turns (`Turns`).
+    """A part that may raise any exception: it is opened again after a pause. Threads take turns (`Turns`).
 
-    ``failures`` has it under ``name``; ``clock`` is nanoseconds without steps. Raises what ``open_part`` does.
+    ``failures`` lists it as ``name``; ``clock`` is steady nanoseconds. Raises the exceptions of ``open_part``.
     """
 
     def __init__(
@@ -259,7 +259,7 @@ class Retried(Generic[_Part]):
 class Awaited(Generic[_Part]):
     """A part that may not be there yet: opened at once, or else by `wait`, again and again until it is.
 
-    ``failures`` has it under ``name``. Raises what ``open_part`` does but `NotYetError`.
+    ``failures`` lists it as ``name``. Raises the exceptions of ``open_part`` except `NotYetError`.
     """
 
     def __init__(

@@ -42,10 +42,10 @@ def requested_host(header: str) -> str:
     """The host of a header ``Host``, in small letters and without brackets and port; empty where it is none."""
     try:
         parts = urlsplit(f"//{header}")
-        valid = parts.port != 0  # which raises for what is no number
+        valid = parts.port != 0  # raises where the port is no number
     except ValueError:
         return ""
-    # What stands before or after brackets is dropped by the parser: it may be all of another site's name.
+    # The parser drops text before or after brackets, which may be all of another site's name.
     plain = parts.netloc == header and re.fullmatch(r"(?:\[[^][]*\]|[^][@]*)(?::\d*)?", header) is not None
     return parts.hostname or "" if valid and plain else ""
 

@@ -39,9 +39,9 @@ def start_log(
 ) -> Log:
     """Buffer the log until `Log.release`, then write it to stderr. So a start that fails says one sentence.
 
-    Unless ``quiet``, the provider of each network and what else was found at the start is logged, and with
+    Unless ``quiet``, the provider of each network and other findings of the start are logged, and with
     ``form="json"`` a line of status now and then.
-    ``fields`` are of every JSON line. No line has what ``redaction`` hides, nor has a traceback.
+    Every JSON line holds ``fields``. No line or traceback holds a secret that ``redaction`` hides.
     """
     stream = logging.StreamHandler()
     as_json = form == "json"

@@ -23,7 +23,7 @@ def installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
 
 
 def the_one(group: str, name: str, *, what: str, built_in: bool) -> EntryPoint | None:
-    """The entry point of that name, or None; ``what`` it is stands in the sentence of an error.
+    """The entry point of that name, or None; the sentence of an error calls it ``what``.
 
     Raises:
         UserError: several packages bring it, or HVT has one of that name itself (``built_in``).
@@ -69,11 +69,11 @@ def health_server(
     failures: Failures,
     lacks: Callable[[Any], str] = lambda _state: "",
 ) -> AbstractContextManager[object]:
-    """What serves a program's ``newest()`` state (None: none yet) at HOST:PORT while the context lasts.
+    """A server of a program's ``newest()`` state (None: none yet) at HOST:PORT while the context lasts.
 
-    After ``stuck_s`` without another the program stands still; ``lacks(state)`` says what keeps it from serving
-    though it is alive, empty for nothing. Raises `UserError` where the address can never be listened on, or what it
-    takes is not installed.
+    After ``stuck_s`` without a newer state the program counts as stuck; ``lacks(state)`` says why a living program is
+    not ready, empty if it is. Raises `UserError` where nothing can ever listen on the address, or the extra is not
+    installed.
     """
     entry = the_one(_GROUP, side, what="health server", built_in=False)
     if entry is None:

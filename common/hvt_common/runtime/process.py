@@ -1,8 +1,8 @@
 """The set-up of a process: the signals that stop it, its threads' priority, its memory allocator.
 
-Priorities, as Linux's niceness: 0 for what the operator sees move, 11 for perception with its networks.
+Priorities, as Linux's niceness: 0 for moving pictures, 11 for perception with its networks.
 
-And what it tells systemd.
+Also the messages to systemd.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def interrupt_on_signals() -> None:
-    """Have SIGTERM and SIGHUP end what runs as Ctrl-C does: it says so, and leaves nothing half done behind."""
+    """Have SIGTERM and SIGHUP end a command as Ctrl-C does: it says so, and leaves nothing half done behind."""
     for one in STOP_SIGNALS:
         if signal.getsignal(one) is signal.SIG_DFL:  # ``nohup`` has SIGHUP ignored
             signal.signal(one, signal.default_int_handler)
@@ -112,7 +112,7 @@ def lower_priority(*, little: bool = False) -> None:
     """Let other threads go before the calling one, and before those that it starts; on Linux only.
 
     ``little``: it still goes before those that are lowered whole, and before x265's.
-    Encoding and decoding are what the operator sees move; detection and stills may come a little later.
+    The operator sees encoding and decoding move; detection and stills may come a little later.
     """
     if sys.platform == "linux":
         thread = threading.get_native_id()
@@ -159,7 +159,7 @@ def share_zenoh_threads() -> None:
     """Have Zenoh take two threads in place of five: one empties the link's queues, one does all else.
 
     Who fills a queue may have to wait until it is emptied, so that these two stay apart. Call it before a session is
-    opened; what the environment says goes first.
+    opened; a value in the environment wins.
     """
     os.environ.setdefault(
         "ZENOH_RUNTIME", "(rx: (handover: app), net: (handover: app), acc: (handover: app))"
@@ -167,10 +167,10 @@ def share_zenoh_threads() -> None:
 
 
 def limit_malloc_arenas() -> None:
-    """Have all threads allocate from two arenas, which reuse what is freed for the next frame; only with glibc.
+    """Have all threads allocate from two arenas, which reuse freed memory for the next frame; only with glibc.
 
     By default glibc gives each thread an arena of its own (up to eight for each processor) and moves its mmap
-    threshold with what is freed. A frame that one thread allocates and another frees then leaves a hole that is not
+    threshold with the sizes freed. A frame that one thread allocates and another frees then leaves a hole that is not
     reused, and the process grows in steps for hours without holding more. Call it before threads are started.
 
     Where the environment has any ``MALLOC_*``, nothing is changed.
@@ -188,8 +188,8 @@ def limit_malloc_arenas() -> None:
 def give_back_holes() -> None:
     """Return the free pages between pictures to the system, which takes a millisecond.
 
-    Once a second it holds a flight's peak to what its parts hold at the same time. Only after `limit_malloc_arenas`:
-    in a program that is not ours all its memory would be gone through, each second.
+    Called once a second, it keeps a flight's peak near the memory in use. It acts only after `limit_malloc_arenas`:
+    in a program that only imports us it would walk through all memory each second.
     """
     if allocator_set.is_set():
         ctypes.CDLL(None).malloc_trim(0)

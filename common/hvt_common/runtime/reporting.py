@@ -1,4 +1,4 @@
-"""The report of a run: a status line, and at its end a table and a JSON file; and what a check before it found."""
+"""The report of a run: a status line, at its end a table and a JSON file; and the findings of a check before it."""
 
 from __future__ import annotations
 

@@ -104,10 +104,10 @@ class Newest(OrderedDict[_Key, _Value]):
 
 
 class SequenceWindow:
-    """A set of numbers from 0, one bit each. What was missed long ago may still come, and is known to be new.
+    """A set of numbers from 0, one bit each. A number missed long ago may still come, and is known to be new.
 
     At most ``pages`` stretches of 4096 numbers are stored, half a kilobyte each; beyond, the one longest unused is
-    forgotten. So forged numbers cost bounded memory, and do not make what is to come look as if it had been.
+    forgotten. So forged numbers cost bounded memory, and do not make future numbers look known.
     """
 
     def __init__(self, *, pages: int = 4096) -> None:
@@ -156,8 +156,8 @@ class StillSequenceWindow:
     def is_copy(self, sequence: int, *, send_ns: int) -> bool:
         """Whether one that is not new is the copy that the edge sent for want of an acknowledgement; once.
 
-        What bears the time of the first is a replay. Of one that came with the backlog, the first on ``roi`` is such
-        a copy.
+        A second message with the send time of the first is a replay. For a still that came with the backlog, the
+        first message on ``roi`` is such a copy.
         """
         with self._lock:
             if send_ns <= self._sent_ns.get(sequence, send_ns):

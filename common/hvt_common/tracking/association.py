@@ -12,7 +12,7 @@ _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-# A box as x1, y1, -x2, -y2: what two boxes share is the larger one of each number. Its sides come out negative.
+# A box as x1, y1, -x2, -y2: two boxes share the larger one of each number. The sides come out negative.
 _SIGNS = np.array([[1.0], [1], [-1], [-1]])
 _PIXEL = np.array([[0.0], [0], [1], [1]])
 

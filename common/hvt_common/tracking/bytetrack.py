@@ -1,11 +1,11 @@
 """ByteTrack: from the detections of each frame to tracks with lasting ids.
 
 Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022. Confident detections
-are matched with predicted tracks first; tracks left over may take a weak detection near them; what is confident and
-still free starts a new track. The rules, constants and oddities are those of the authors' program, so that its
+are matched with predicted tracks first; tracks left over may take a weak detection near them; a confident one that
+is still free starts a new track. The rules, constants and oddities are those of the authors' program, so that its
 results are reproduced.
-What is added: frames may pass without detection (`ByteTracker.predict`), and what finds no match after
-them is matched once more with a margin; where the camera is followed, boxes go with what is in them (`flow`); between
+Added are: frames may pass without detection (`ByteTracker.predict`), and tracks without a match after
+them are matched once more with a margin; where the camera is followed, boxes go with their contents (`flow`); between
 detections a box hardly changes its size by itself; all tracks end where another scene begins; the time of lost tracks
 is counted in frames whatever the rate of detection, and where a slow machine detects more seldom than that time
 lasts, in detections; a track has a class.
@@ -48,14 +48,14 @@ _LONGEST_S: Final = 10.0
 _LEAST_DETECTIONS: Final = 3
 """Detections that a lost track is remembered for, where they are further apart than the buffer is long."""
 _MOST_SHIFT: Final = 0.1
-"""Of the picture's sides, since the last update: what came into view has no tracks yet (`CameraMotion.shift`)."""
+"""Of the picture's sides, since the last update: the new part of the view has no tracks (`CameraMotion.shift`)."""
 
 _OLD_S: Final = 1.5
 _OLD_GAPS: Final = 2
 """Tracks not seen for so long, and for so many times the longest of the last gaps, are not listed."""
 
 _MOST_PICTURES: Final = 24
-"""So many are kept while one of them is being searched: what is found there goes through all of them."""
+"""Kept while one of them is being searched: the objects found there are carried through all later ones."""
 
 _MOST_GROWTH: Final = 0.75
 """Box lengths; wider, and neighbours in a queue of cars are taken for each other."""
@@ -63,7 +63,7 @@ _MOST_GROWTH: Final = 0.75
 
 @dataclass(frozen=True, slots=True)
 class _Searched:
-    """What stood before a frame that is being searched, and the steps to it and to those after it."""
+    """The tracks before a frame that is being searched, and the steps to it and to later frames."""
 
     table: TrackTable
     before: int | None
@@ -125,7 +125,7 @@ class ByteTracker:
 
         That is each ``every`` frames while something is to be confirmed or much has come into view; else twice or
         three times as many, up to ``most``, after updates that found nearly all as predicted, and ``most`` while the
-        newest frame shows what the last update saw.
+        newest frame shows the same as the last update.
         """
         if frames < every or frames >= most or (self._table.phase == UNCONFIRMED).any():
             return frames >= every
@@ -294,7 +294,7 @@ class ByteTracker:
         table.scores[0, rows] = confidences
 
     def _turn(self, detections: _Indices, frame_index: int) -> None:
-        # Each track's phase after an update; what is over ends.
+        # Sets each track's phase after an update; removes ended tracks.
         table = self._table
         phase = np.where(detections >= 0, IF_FOUND.take(table.phase), IF_MISSED.take(table.phase))
         table.since[phase != table.phase] = frame_index

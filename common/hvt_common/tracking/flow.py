@@ -26,10 +26,10 @@ _MOST_APART_PX: Final = 1.5
 _MOST_APART: Final = 0.15
 """Points agree where they lie so far from the median motion, of the box's shorter side, or in gray pixels."""
 _MOST_CHANGED: Final = 30.0
-"""Levels: where a point looks so different it is another thing."""
+"""Levels: a point that looks so different shows something else."""
 _MOST_SCALE: Final = 1.1
 _LEAST_PX: Final = 10.0
-"""Of the shorter side in the pictures: of what is smaller the windows see the ground."""
+"""Of the shorter side in the pictures: the windows around smaller objects mostly see the ground."""
 
 _across = (np.arange(_SIDE) + 0.5) / _SIDE * _MIDDLE + (1 - _MIDDLE) / 2
 _GRID: Final = np.stack(np.meshgrid(_across, _across), axis=-1).reshape(1, _POINTS, 2)
@@ -69,7 +69,7 @@ def _of_large(
     points = starts + sides * _GRID
     first = (points - 0.5).reshape(-1, 1, 2).astype(np.float32)
     guess = first + np.repeat(expected * ratio, _POINTS, axis=0)[:, None].astype(np.float32)
-    # Most of the time goes into the pictures' pyramids: only what lies around the boxes is looked at.
+    # Most of the time goes into the pictures' pyramids: only the surroundings of the boxes get one.
     ends = np.concatenate((first, guess))[:, 0]
     low = np.clip(ends.min(axis=0).astype(int) - _AROUND_PX, 0, None) // _ALIGNED * _ALIGNED
     high = np.minimum(ends.max(axis=0).astype(int) + _AROUND_PX, now.shape[::-1])

@@ -89,7 +89,7 @@ def predict(states: States) -> None:
 
 
 def coast(states: States) -> None:
-    """Step by one frame without detection, in place: what grew or shrank ever on would soon fit nothing."""
+    """Step by one frame without detection, in place: a box that grew or shrank on and on would soon fit nothing."""
     limit = _MOST_SIZE_STEP * np.abs(states[POSITION, 2:])
     sizes = states[VELOCITY, 2:]
     np.clip(_SIZE_DECAY * sizes, -limit, limit, out=sizes)
@@ -100,8 +100,8 @@ def correct(states: States, measured: _Floats, *, gap: int = 1) -> None:
     """Take in one measurement (x, y, a, h) a state, in place; ``measured`` is (4, N) in the order of ``states``.
 
     ``gap`` is the number of frames since the measurement before. The authors' noise of the aspect ratio averages it
-    over some ten measurements, one a frame; where those are rare, what drives into the picture would keep the shape
-    of its bonnet for seconds. So a measurement counts for the more, the longer nothing was measured.
+    over some ten measurements, one a frame; where those are rare, a car that drives into the picture would keep the
+    shape of its bonnet for seconds. So a measurement counts for the more, the longer nothing was measured.
     """
     innovation_var = _MEASURED_BY_HEIGHT * np.square(states[POSITION, 3])
     innovation_var += _MEASURED_FIXED / gap**2

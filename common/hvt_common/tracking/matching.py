@@ -24,11 +24,11 @@ _MOST_APART: Final = 0.2
 
 _AS_PREDICTED_IOU: Final = 0.5
 _MOST_SURPRISES: Final = 0.1
-"""Tracks elsewhere than predicted or not found, and what may start new ones, as a share of the tracks."""
+"""Tracks elsewhere than predicted or not found, and detections that may start tracks, as a share of the tracks."""
 
 
 class Match(NamedTuple):
-    """What the detections of a frame are."""
+    """The tracks of a frame's detections."""
 
     detections: _Indices
     """(N,) the detection of each track; -1: none."""
@@ -41,7 +41,7 @@ class Match(NamedTuple):
 def match(
     table: TrackTable, seen: TrackerInput, settings: TrackerSettings, *, growth: float, held: _Floats | None
 ) -> Match:
-    """What is left over is matched once more with boxes larger by ``growth``, also with the tracks at ``held``."""
+    """The rest is matched once more with boxes larger by ``growth``, also with the tracks at ``held``."""
     # A detection at exactly the threshold is neither confident nor weak in the authors' program.
     free = seen.confidences > settings.track_confidence
     found = np.full(len(table), -1)

@@ -1,4 +1,4 @@
-"""Tracks from one frame to the next: at their velocity, with the camera, and with what a picture shows in them."""
+"""Tracks from one frame to the next: by their velocity, the camera's motion, and the optical flow inside them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Step:
 
 
 class Pictures:
-    """What pictures tell of the motion between frames; nothing unless ``enabled``."""
+    """The motion between frames as pictures show it; nothing unless ``enabled``."""
 
     def __init__(self, *, enabled: bool, longest_frames: int) -> None:
         self._camera = CameraMotion(scale=None) if enabled else None
@@ -74,7 +74,7 @@ class Pictures:
         return step
 
     def with_flow(self, step: Step, before: Gray | None, table: TrackTable, *, frames: int) -> Step:
-        """The same step with what its picture shows of the tracks that were found; without after a long time."""
+        """The same step with the flow inside the tracks of the last detection; without it after a long time."""
         moving = (table.phase >= TRACKED).nonzero()[0]
         now = step.gray
         if before is None or now is None or before.shape != now.shape or not len(moving):
@@ -100,7 +100,7 @@ def move(table: TrackTable, step: Step, *, frames: int, hold_unconfirmed: bool) 
         kalman.coast(states)
     if hold_unconfirmed:
         # The authors' program matches unconfirmed tracks where they started, without the step to this frame.
-        # They are at rest; what it changes is the gain of the correction that confirms them.
+        # They are at rest; it only changes the gain of the correction that confirms them.
         before = states.copy()
         kalman.predict(states)
         np.copyto(states, before, where=table.phase == UNCONFIRMED)

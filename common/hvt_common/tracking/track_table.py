@@ -44,14 +44,14 @@ class TrackerInput:
 
     @classmethod
     def of(cls, detections: Detections, *, low_confidence: float) -> TrackerInput:
-        """Leave out what is weak, not finite or without area; order what remains.
+        """Leave out detections that are weak, not finite or without area; order the others.
 
         New ids are given in this order, so it must not depend on the order of the input: equal confidences are
         ordered by box and class. A `ValueError` means that one of the class ids is negative.
         """
         boxes = detections.boxes_xyxy_px.T.astype(np.float64, order="C")
         confidences, class_ids = detections.confidences, detections.class_ids
-        # Comparisons with NaN are false: what is not a number fails them all.
+        # Comparisons with NaN are false: a box with one fails them all.
         usable = (
             (boxes[0] < boxes[2]) & (boxes[1] < boxes[3]) & (np.maximum.reduce(np.abs(boxes)) < _FARTHEST_PX)
         )

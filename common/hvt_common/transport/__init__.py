@@ -1,5 +1,5 @@
-"""HVT over Zenoh: `session` opens it as `zenoh_config` says, `inbox` queues what arrives and notices too much.
+"""HVT over Zenoh: `session` opens it as `zenoh_config` says, `inbox` queues arriving messages and notices floods.
 
-`stale_sockets` ends what a dark line left behind. `link_doctor` is the door for who explains why there is no link,
-and reads the rights of a key.
+`stale_sockets` ends sockets that a dark line left behind. `link_doctor` is the door for an extra that explains why
+there is no link, and reads the rights of a key.
 """

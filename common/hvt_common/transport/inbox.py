@@ -1,6 +1,6 @@
-"""The bounded queue between Zenoh's callbacks, which must never block, and our own threads; and what notices a flood.
+"""The bounded queue between Zenoh's callbacks, which must never block, and our own threads; and a watch for floods.
 
-A flood is far more messages of one kind than a working peer sends. Of that time is an argument.
+A flood is far more messages of one kind than a working peer sends. Its watch takes time as an argument.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class ReceivedQueue(Protocol):
 class Inbox:
     """A bounded queue between Zenoh's callbacks and one of our threads; putting never blocks.
 
-    It is bounded in messages and in bytes: a payload may have megabytes. What does not fit is dropped, so that what
-    is queued stays whole up to a gap. With a ``share`` below 1 no key may take more than that of it: a flood under
+    It is bounded in messages and in bytes: a payload may have megabytes. A message that does not fit is dropped:
+    the queue stays whole up to a gap. With a ``share`` below 1 no key may take more than that of it: a flood under
     one does not keep the others out.
     """
 
@@ -136,7 +136,7 @@ class TokenBucket:
 class FloodWatch:
     """Counts messages of each kind second by second; may be used by any thread.
 
-    ``most_per_s`` of one kind in a second are no flood: at least twice what the busiest peer sends.
+    ``most_per_s`` of one kind in a second are no flood: at least twice the rate of the busiest peer.
     """
 
     def __init__(self, *, most_per_s: int) -> None:

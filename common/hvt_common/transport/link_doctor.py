@@ -18,7 +18,7 @@ from hvt_common.transport.zenoh_config import LinkSettings, configure
 class Rights:
     """The access control of our own Zenoh configuration, read as Zenoh reads it.
 
-    A subject is known by the common name of its certificate. Zenoh drops silently what is not allowed; with its own
+    A subject is known by the common name of its certificate. Zenoh drops forbidden messages silently; with its own
     rules a side can say so.
     """
 

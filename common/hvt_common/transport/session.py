@@ -91,8 +91,8 @@ def _open_listening_later(
 def loses_declarations(settings: LinkSettings, session: zenoh.Session) -> Callable[[], bool]:
     """Whether a declaration may be lost on its way now: over UDP, here or, for all that is known, behind a router.
 
-    Zenoh makes each once, so who needs it makes it again, as `another_key` says. Not over TLS and QUIC: rights name
-    whole keys, so what one may use would be withdrawn for what one may not.
+    Zenoh makes each once, so its owner makes it again, as `another_key` says. Not over TLS and QUIC: rights name
+    whole keys, so a key that one may use would be withdrawn for one that one may not.
     """
     config = configure(settings)[0]
     ends = "".join(str(config.get_json(f"{side}/endpoints")) for side in ("connect", "listen"))
@@ -134,7 +134,7 @@ def subscribe(
 ) -> zenoh.Subscriber[None]:
     """Copy every message of the key expression into the inbox, with its time by ``clock``; deletions are ignored.
 
-    ``on_error(key, error)`` gets what goes wrong with a message, which Zenoh would print and forget.
+    ``on_error(key, error)`` gets the exception of a message, which Zenoh would print and forget.
     """
 
     def receive(sample: zenoh.Sample) -> None:
@@ -173,8 +173,8 @@ def query(
 ) -> bytes | None:
     """The first answer of a queryable channel; None when there is none in time, after ``timeout_s``.
 
-    Over UDP a question or its answer may be lost: after half of the time it is asked once more, so what it asks for
-    must be safe to ask for twice.
+    Over UDP a question or its answer may be lost: after half of the time it is asked once more, so it must be a
+    question that is safe to ask twice.
     """
     found: SimpleQueue[bytes | None] = SimpleQueue()
 

@@ -55,7 +55,7 @@ class Connection:
 
 
 def connections(table: Path, *, inodes: Container[str] | None = None) -> Iterator[Connection]:
-    """What one of `TCP_TABLES` has, but listening sockets; with ``inodes`` those alone, quickly out of thousands."""
+    """The sockets in one of `TCP_TABLES` but listening ones; with ``inodes`` only those, quickly out of thousands."""
     for line in table.read_text(encoding="ascii").splitlines()[1:]:
         _, ours, theirs, state, *_, inode = line.split(maxsplit=10)[:10]
         if state != _LISTENING and (inodes is None or inode in inodes):
@@ -99,8 +99,8 @@ def end_of(locator: object) -> str:
 class StaleSockets:
     """Watches the sockets of one session, in a thread; a context manager, left before the session is closed.
 
-    Zenoh (1.10) closes with SO_LINGER: while nobody acknowledges what was sent last, close(2) holds one of its few
-    threads for ten seconds, and with it the next connection, at either end, and what others send. And a handshake
+    Zenoh (1.10) closes with SO_LINGER: while nobody acknowledges the last bytes, close(2) holds one of its few
+    threads for ten seconds, and with it the next connection, at either end, and others' messages. And a handshake
     that began in darkness has all of ``open_timeout``, even if the line is back: a tunnel or proxy on the way may
     have accepted it, and says nothing. So no socket lingers, and a handshake that hangs is shut down as soon as a
     probe that began after it was answered, and it was not: on a slow line the older has its answer first. The next
@@ -111,7 +111,7 @@ class StaleSockets:
     link that ended while the program was stopped.
 
     Other sockets of the process are none of its business, even where they are connected to the same place: Zenoh's
-    have the send buffer that its configuration says. What is a link of any session here is no handshake.
+    have the send buffer that its configuration says. A link of any session here is no handshake.
     """
 
     _sessions: ClassVar[list[zenoh.Session]] = []
@@ -139,7 +139,7 @@ class StaleSockets:
         listen = re.findall(r'"(?:udp|quic)/[^"]*?:(\d+)["?#]', config.get_json("listen/endpoints"))
         self._datagram_ports = set(listen)
         self._unread: dict[str, tuple[int, int]] = {}
-        """What waits at a UDP listener, and for how many checks it has not become less."""
+        """Bytes that wait at a UDP listener, and for how many checks they have not become fewer."""
         self._next_unread_s = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-sockets", daemon=True)
@@ -291,7 +291,7 @@ def _send_buffers(config: zenoh.Config) -> list[int]:
 
 
 def _given_buffer(size: int) -> int:
-    # What the kernel makes of it.
+    # The size that the kernel really gives.
     with socket.socket() as one:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, min(size, 2**31 - 1))
         return one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
@@ -335,7 +335,7 @@ def _shut_down(fd: int, inode: int) -> None:
 
 
 def _received_s(fd: int, inode: int) -> float:
-    # When data came last, or else when it was connected; long ago for what still connects.
+    # When data came last, else when it was connected; long ago for a socket that still connects.
     with suppress(OSError), same_socket(fd, inode) as one:
         info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)
         (ago_ms,) = struct.unpack_from("=I", info, _LAST_DATA_RECEIVED)

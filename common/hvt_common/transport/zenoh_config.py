@@ -39,7 +39,7 @@ _DEFAULTS: Mapping[str, Any] = {
     "transport/unicast/open_timeout": 3000,
     # An outage is noticed after about this long in place of 10 s.
     "transport/link/tx/lease": 3000,
-    # Small batches and a small socket buffer: back-pressure reaches our own queues, which know what to drop,
+    # Small batches and a small socket buffer: back-pressure reaches our own queues, which drop wisely,
     # after some tenths of a second of video. Four batches hold a keyframe.
     "transport/link/tx/batch_size": 16384,
     "transport/link/tx/queue/size/data_high": 4,
@@ -78,10 +78,10 @@ class LinkSettings:
     insecure: bool = False
     """Allow listening beyond loopback without keys."""
     links: Literal[1, 2] = 1
-    """How many links to each place that we connect to over TCP or TLS: with two, what is small and urgent does not
-    wait behind pictures in a full socket. ``max_links: 2`` in the file says the same."""
+    """How many links to each place that we connect to over TCP or TLS: with two, small urgent messages do not wait
+    behind pictures in a full socket. ``max_links: 2`` in the file says the same."""
     name: str | None = None
-    """Who this machine is: the id of an edge, which its certificate has to bear; None for whoever that names."""
+    """The id of this edge, which its certificate has to bear; None for any name in the certificate."""
 
 
 def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
@@ -108,7 +108,7 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     if connect:
         _insert_endpoints(config, "connect", _split(connect) if two else connect)
     if settings.links == 2 or (effective and not _mentions(said, _MAX_LINKS)):
-        # Who listens takes what comes. Asking for more than one makes every handshake a kilobyte longer.
+        # A listener takes either number. Asking for more than one makes every handshake a kilobyte longer.
         config.insert_json5(_MAX_LINKS, "2")
     if settings.role == "ground" and (connect or _endpoints(said, "connect")) and not _mentions(said, "mode"):
         # Since Zenoh 1.9 a router does not pass messages between two peers, but it does between a peer and a router.
@@ -228,7 +228,7 @@ def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...
     scoped = [_scoped(one, listening=side == "listen") for one in endpoints]
     try:
         config.insert_json5(f"{side}/endpoints", json.dumps(scoped))
-    except zenoh.ZError as error:  # what stands behind ? and # is Zenoh's to judge
+    except zenoh.ZError as error:  # Zenoh judges the text behind ? and #
         reason = without_build_paths(re.sub(r".*msg: \"|\", location: .*", "", str(error)))
         raise UserError(f"--{side} {' '.join(endpoints)}: Zenoh does not accept it: {reason}") from None
 

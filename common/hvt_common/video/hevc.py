@@ -181,7 +181,7 @@ def nal_units(stream: bytes) -> list[bytes]:
 
 
 def without_filler(access_unit: bytes) -> bytes:
-    """The same picture without filler data: some encoders fill up with it what a still scene leaves of their rate."""
+    """The same picture without filler data: some encoders pad a still scene to their rate with it."""
     if _FILLER_START not in access_unit:
         return access_unit
     return b"".join(LONG_START + one for one in nal_units(access_unit) if nal_kind(one) != _FILLER)

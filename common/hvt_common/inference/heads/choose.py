@@ -167,7 +167,7 @@ class Kind:
     """One head by its name, with the marks by which a network's outputs are known for it.
 
     It *fits* where the outputs have its shape. It is *proven* where the values of the trial, the names of the outputs
-    or the number of class names leave no other: then `Match.proof` says what. With ``--head`` a fit is enough. In the
+    or the number of class names leave no other (`Match.proof`). With ``--head`` a fit is enough. In the
     shapes A is the number of cells of all strides, which no number of classes or objects equals by accident.
     """
 
@@ -258,7 +258,7 @@ def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
     """The head that the outputs belong to; ``wanted`` is as of ``--head``.
 
     Raises:
-        UserError: the half sentence that says why none is certain, and what decides it.
+        UserError: half a sentence on why none is certain, and which option decides it.
     """
     check_head_name(wanted)
     said = trial.metadata.get("head", "")

@@ -1,6 +1,6 @@
 """The contract of a head: which outputs it reads, how it wants its pixels, and the steps from its numbers to boxes.
 
-No form trusts a number: what is not finite, has no area, is no probability or names no class is left out. Raw YOLOX
+No form trusts a number: boxes that are not finite, have no area, no probability or no class are left out. Raw YOLOX
 is here, as the embedded detector writes it.
 """
 
@@ -32,7 +32,7 @@ class HeadOutput:
     second: npt.NDArray[np.bool_] | None = None
     """(N,) which are of the second one of two networks in one file; None where there is one."""
     beyond: bool = False
-    """Some were left out whose score is above 1: what is no probability is no score."""
+    """Boxes with a score above 1 were left out: that is no probability."""
 
 
 class Decoder(Protocol):

@@ -23,7 +23,7 @@ _MOST_STEPS = 12
 _SAME = frozenset({"Cast", "Identity", "Transpose", "Squeeze", "Unsqueeze", "Reshape"})
 _ARITHMETIC = frozenset({"Sub", "Add", "Mul", "Div"})
 _TURNING = {"Gather": 1, "Slice": 4, "StridedSlice": 3}
-"""What may put the last channel first, and the place of the input that says so."""
+"""Operators that may reverse the channels, and the place of the input that decides it."""
 _NO_PIXELS = frozenset({"Shape", "ShapeOf"})
 _BYTE_SLOPE, _BYTE_MEAN = 0.05, 10.0
 """A smaller slope, or a larger mean, is for pixels of 0…255."""
@@ -53,7 +53,7 @@ class _Node:
 
 
 def own_steps(path: Path) -> OwnSteps:
-    """What a checked file does to its pixels before all else; nothing, as most."""
+    """The first steps of a checked file on its pixels; most files have none."""
     try:
         graph = _ir_graph(path) if is_ir(path) else _onnx_graph(path)
     except (OSError, ValueError, LookupError, ET.ParseError):
@@ -142,7 +142,7 @@ def _onnx_graph(path: Path) -> tuple[str, dict[str, list[_Node]], dict[str, _Num
 def _graph(
     data: mmap.mmap, start: int, end: int
 ) -> tuple[str, dict[str, list[_Node]], dict[str, _Numbers | None]]:
-    # The first input, the nodes by what they take, and the numbers of constants that are few.
+    # The first input, the nodes by the name of an input, and the values of small constants.
     users: dict[str, list[_Node]] = {}
     constants: dict[str, _Numbers | None] = {}
     inputs = []

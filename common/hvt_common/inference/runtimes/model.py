@@ -1,6 +1,6 @@
 """Models, on onnxruntime or another runtime: the only file that imports onnxruntime.
 
-A model file comes from outside: `model_file` checks it first, and what it declares has bounds. It is read as ONNX
+A model file comes from outside: `model_file` checks it first and bounds its declarations. It is read as ONNX
 whatever its name ends in, and no custom operator library is registered. A model that another runtime will run is
 opened by onnxruntime first: that gives ports and metadata, and no runtime gets a file that onnxruntime refuses. An
 OpenVINO model (``.xml``) is run by OpenVINO alone.
@@ -138,10 +138,10 @@ class OnnxModel:
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
     metadata: Mapping[str, str]
-    """What the exporter wrote into the file."""
+    """Written into the file by the exporter."""
     runner: _Runner
     provider: ProviderChoice
-    """What runs it, and why."""
+    """The provider that runs it, with the reason."""
 
     def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
         """Run the model on its inputs, mostly one; return its outputs in their declared order.
@@ -177,7 +177,7 @@ class _OnnxRuntimeRunner:
 
 
 def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxModel:
-    """Open an ONNX file, or OpenVINO's ``.xml``; what runs it is logged, with the reason.
+    """Open an ONNX file, or OpenVINO's ``.xml``; the provider is logged, with the reason.
 
     Raises `UserError` where there is no such file, or it is too large, no ONNX model or one that the runtime
     cannot load; or for a provider that is unknown, not installed or cannot start.

@@ -61,7 +61,7 @@ _OTHERS: Mapping[bytes, str] = MappingProxyType(
         rb"\x89HDF": "but Keras's: export it as ONNX",
     }
 )
-"""What is given in place of a model, by how it begins."""
+"""Files that are given by mistake, by their first bytes."""
 
 _YOUNG_NS = 2 * SECOND_NS
 """Within that a file may be written again without another time: that is of 10 ms, or of 2 s (FAT)."""
@@ -243,7 +243,7 @@ def is_ir(path: Path) -> bool:
 
 
 def files_of(path: Path) -> tuple[Path, ...]:
-    """The files that a model is: itself, and beside an IR the weights, and what Ultralytics says of them."""
+    """The files of a model: itself, and beside an IR its weights and the metadata of Ultralytics."""
     said = path.with_name(_ULTRALYTICS)
     return (path, path.with_suffix(".bin"), *[said] * said.is_file()) if is_ir(path) else (path,)
 
@@ -269,7 +269,7 @@ def check_ir_file(path: Path) -> None:
 
 
 def ir_metadata(path: Path) -> dict[str, str]:
-    """The ``model_info`` of an IR, and what its ONNX file said, by ONNX's names: ``names`` of the classes, and so on.
+    """The ``model_info`` of an IR and its ONNX file's metadata, by ONNX's names: ``names`` of the classes and so on.
 
     ``mean_values``, ``scale_values`` and ``reverse_input_channels``, of BGR pixels, become ``hvt.mean`` and so on.
     Ultralytics writes its own into ``metadata.yaml`` beside the file: its plain values and names are read too. Raises
@@ -280,7 +280,7 @@ def ir_metadata(path: Path) -> dict[str, str]:
         root = ET.parse(path).getroot()  # noqa: S314 - checked: no entities
     except (ET.ParseError, OSError) as error:
         raise UserError(f"model {path} is not an OpenVINO model, or is cut short ({error})") from error
-    places = ("framework", "model_info")  # the first has what the ONNX file said that it was made of
+    places = ("framework", "model_info")  # the first holds the metadata of the ONNX file that it was made of
     said = {one.tag: one.get("value", "") for place in places for one in root.iterfind(f"rt_info/{place}/*")}
     metadata = _yaml_of_ultralytics(path.with_name(_ULTRALYTICS))
     found = (root.find(f"{place}/reverse_input_channels") for place in _OF_CONVERSION)
@@ -295,7 +295,7 @@ def ir_metadata(path: Path) -> dict[str, str]:
 
 _YES = ("yes", "true", "1")
 _OF_CONVERSION = ("rt_info/conversion_parameters", "rt_info/cli_parameters", "meta_data/cli_parameters")
-"""What OpenVINO's converter was told."""
+"""The parameters of OpenVINO's converter."""
 
 
 def _pixels_of_model_info(said: Mapping[str, str]) -> dict[str, str]:
@@ -305,7 +305,7 @@ def _pixels_of_model_info(said: Mapping[str, str]) -> dict[str, str]:
     mean, divisors = (said.get(key, "").strip("[]() ") for key in ("mean_values", "scale_values"))
     if mean or divisors:
         found["hvt.mean"] = mean or "0"
-        with suppress(ValueError, ZeroDivisionError):  # what is no number is refused as it stands
+        with suppress(ValueError, ZeroDivisionError):  # text that is no number is refused later
             divisors = " ".join(str(1 / float(one)) for one in (divisors or "1").replace(",", " ").split())
         found["hvt.scale"] = divisors
     if "reverse_input_channels" in said:

@@ -43,7 +43,7 @@ class PlugInDetector:
     """A detector of another package, whose every answer is checked; itself a `Detector`.
 
     Construction runs it once on grey. Raises `UserError` where it does not load, does not run or breaks the contract;
-    `detect` raises what the package does, and `ValueError` for an answer that cannot be.
+    `detect` raises the exceptions of the package, and `ValueError` for an impossible answer.
     """
 
     def __init__(self, entry: EntryPoint, spec: str, *, confidence: float) -> None:

@@ -71,7 +71,7 @@ def choose_provider(
 
     ``onnxruntime`` has the providers of the installed onnxruntime; ``openvino()`` looks for OpenVINO, where the
     answer matters, which for ``auto`` it does not where the network is ``light``. Raises `UserError` for an unknown
-    word, or a provider that is not installed, with what installs it.
+    word, or a provider that is not installed, with the command that installs it.
     """
     if wanted not in PROVIDERS:
         raise UserError(f"--provider '{wanted}' is not known: choose one of {', '.join(PROVIDERS)}")

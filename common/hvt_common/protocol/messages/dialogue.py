@@ -48,7 +48,7 @@ class Command(StrEnum):
     STILL_OUTCOME = "still-outcome"
     """The outcome of an accepted still."""
     TRACKS = "tracks"
-    """What the edge tracks now, by its own ids."""
+    """The edge's present tracks, by its own ids."""
     SET_BUDGET = "set-budget"
     SET_METHOD = "set-method"
     SEND_BACKLOG = "send-backlog"
@@ -115,7 +115,7 @@ class ControlAnswer(Message):
     tracks: tuple[TrackNow, ...] = wire_field(ListOf(Nested(TrackNow), MAX_TRACKS_NOW))
     """For the command ``tracks``; else empty."""
     note: str = wire_field(Text(200), default="")
-    """What else is to be said where accepted, in a sentence; of a pending still, how it comes and when."""
+    """A sentence for the user beside an accepted command; for a pending still, how and when it will come."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,12 +178,12 @@ class Feedback(Message):
     """Objects of which chunks were received since the last report."""
     objects_detected: int = wire_field(Int(-1, 65535), default=-1)
     """Objects that the ground's own detector showed when it last looked at a picture, up to ``last_frame_index``.
-    What only the edge's tracks or stills show does not count. -1 before it has looked."""
+    Objects known only from the edge's tracks or from stills do not count. -1 before it has looked."""
     missing_base: tuple[int, ...] = wire_field(ListOf(Int(0, U32), MAX_MISSING_BASE), default=())
     """Sequences of ``base`` behind which newer ones wait; the edge may send each again. None where they are more: a
     keyframe is the shorter way then."""
 
     @property
     def lost_so_far(self) -> int:
-        """With what is missing now."""
+        """Lost frames, the missing ones of now included."""
         return self.lost + len(self.missing_base)

@@ -29,7 +29,7 @@ WIRE_VERSION = 5
 SPOKEN_VERSIONS = (5,)
 """Of messages that come over the link now."""
 READ_VERSIONS = (4, 5)
-"""Where they were stored: in logs, recordings, and what an edge kept on its disk."""
+"""Of stored messages: in logs, in recordings, and on an edge's disk."""
 MOST_VERSION = 255
 MOST_UNKNOWN_FIELDS = 16
 """So many fields behind the last known one are skipped, in each array; with more it is no message of ours."""
@@ -92,7 +92,7 @@ class Message:
 
     @classmethod
     def of_version(cls, version: int, values: list[Any]) -> Self:
-        """From what a message of that version holds."""
+        """The message from the field values of that version."""
         return from_values(cls, values, version)
 
     def pack(self, payload: bytes = b"") -> bytes:
@@ -126,7 +126,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class PackedMessage:
-    """A message whose fields are packed once, for sending at any time: `with_fields` packs only what differs."""
+    """A message whose fields are packed once, for sending at any time: `with_fields` packs only changed fields."""
 
     message: type[Message]
     fields: Mapping[str, bytes]
@@ -140,7 +140,7 @@ class PackedMessage:
         return cls(type(sent), {name: _packed(kind.encode(getattr(sent, name))) for name, kind in table})
 
     def with_fields(self, **values: Any) -> PackedMessage:
-        """The same message with other values of these fields; what two fields promise together is not checked."""
+        """The same message with other values of these fields; rules over two fields are not checked."""
         table = dict(kinds(self.message))
         changed = {name: _packed(table[name].encode(value)) for name, value in values.items()}
         return replace(self, fields={**self.fields, **changed})
@@ -273,7 +273,7 @@ def _too_deep(value: Any, levels: int) -> bool:
 
 @cache
 def _layout(message: type, version: int) -> tuple[tuple[tuple[str, Kind], ...], int, Mapping[str, Any]]:
-    # Of the messages of a version: their fields, how many of them the first had, and what the later fields are.
+    # Of a version: its fields, the number of required ones, and the values of fields that came later.
     there = [item for item in fields(message) if item.metadata["since"] <= version]
     later = {item.name: item.metadata["before"] for item in fields(message) if item not in there}
     table = tuple((item.name, item.metadata["wire"]) for item in there)

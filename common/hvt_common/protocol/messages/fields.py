@@ -1,7 +1,7 @@
 """The kinds of field a message may have. Each one checks the same bounds when it packs and when it parses.
 
 `Kind.encode` takes one of our own values and raises ValueError when it is out of bounds: that is a bug here.
-`Kind.decode` takes what MessagePack held and raises `WireError`: that is a bad message of the other side.
+`Kind.decode` takes a value from MessagePack and raises `WireError`: the other side sent a bad message.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Kind(ABC):
         """The value as MessagePack is to hold it; ValueError when it is out of bounds."""
         try:
             raw = self._encode(value)
-            self.decode(raw)  # what we send is held to the same rules as what we receive
+            self.decode(raw)  # sent and received values obey the same rules
         except _UnsendableError:
             raise
         except (WireError, TypeError, ValueError, OverflowError, AttributeError) as error:
@@ -157,7 +157,7 @@ class Flag(Kind):
 class Text(Kind):
     """UTF-8 of at most ``max_bytes`` without controls and changes of direction, which could rewrite a terminal.
 
-    The rule is the same under every version of Unicode; who shows text replaces what does not print
+    The rule is the same under every version of Unicode; a display replaces characters that do not print
     (`units.shown_text`).
     """
 

@@ -1,7 +1,7 @@
 """The payload of ``pose``: where the camera was, in about 35 bytes. docs/wire-messages.md has it as a table.
 
-A report that stands by itself says everything in numbers of fixed length. The next ones say what changed since the
-one before: of the place what changed in its change, since a vehicle goes on as it went.
+A report that stands by itself holds everything in numbers of fixed length. The next ones hold differences from the
+report before; for the place, the difference of differences, since a vehicle mostly keeps its velocity.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ class Decoder(Coder):
         self._next = _WINDOW_BYTES
         self._range = _FULL
 
-    def bit(self, context: Context, bit: int) -> int:  # noqa: ARG002 - what the encoder would write
+    def bit(self, context: Context, bit: int) -> int:  # noqa: ARG002 - the encoder writes it
         bound = (self._range >> 16) * context.zero
         read = int(self._code >= bound)
         if read:
@@ -162,7 +162,7 @@ class Decoder(Coder):
         self._normalise()
         return read
 
-    def plain(self, value: int, bits: int) -> int:  # noqa: ARG002 - what the encoder would write
+    def plain(self, value: int, bits: int) -> int:  # noqa: ARG002 - the encoder writes it
         read = 0
         for _ in range(bits):
             self._range >>= 1

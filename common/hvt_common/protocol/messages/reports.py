@@ -174,7 +174,7 @@ class Status(Message):
     health: Health = wire_field(Nested(Health))  # noqa: RUF009 - a dataclass field, not a default
     failed: tuple[FailedPart, ...] = wire_field(ListOf(Nested(FailedPart), MOST_FAILED_PARTS))
     levers: str = wire_field(Text(120))
-    """What is sent beside the video and why, one line for people; empty where settings alone decide."""
+    """The decisions of ``auto`` with their reasons, one line for people; empty where settings alone decide."""
     frames: tuple[int, ...] = wire_field(ListOf(_COUNT, 32), default=())
     """How many source frames are in each group of `FRAME_GROUPS`, in its order, zeros at the end left out."""
     coded_fps: float = wire_field(Scaled(0, 1000, 100), default=0.0)

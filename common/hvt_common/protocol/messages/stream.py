@@ -163,7 +163,7 @@ class StillWire(OfStill):
         return cls.of(RoiHeader.of_version(version, values))  # type: ignore[return-value]
 
     def header(self) -> RoiHeader:
-        """What it says; raises `WireError` for a place that is none."""
+        """The header with its boxes unpacked; raises `WireError` for an impossible place."""
         if len(self.place) not in (8, 10):
             raise WireError(f"a place of {len(self.place)} numbers: 8 or 10 are accepted")
         x1, y1, width, height, left, top, right, bottom, *coded = self.place
@@ -195,13 +195,13 @@ _SAME = tuple(name for name, _ in kinds(StillWire) if name not in ("place", "bas
 class RoiHeader(OfStill):
     """Attachment of ``roi``. Boxes are x1, y1, x2, y2 in source pixels, x2 and y2 exclusive.
 
-    Its fields are those of version 4; `StillWire` is what is sent.
+    Its fields are those of version 4; `StillWire` is the form on the link.
     """
 
     box_source_px: tuple[float, float, float, float] = wire_field(_BOX)
     """The track's box at that frame, in eighths of a pixel; may reach beyond the frame."""
     crop_source_px: tuple[int, int, int, int] = wire_field(_CROP)
-    """What the still shows."""
+    """The part of the source frame in the still."""
     class_name: str = wire_field(Text(64))
     """By the edge's detector. As it comes it may be an index: see `named`."""
     confidence: float = wire_field(Scaled(0, 1, 1000))
@@ -210,7 +210,7 @@ class RoiHeader(OfStill):
     codec: str = wire_field(Text(24))
     quality_pct: int = wire_field(Int(0, 100))
     parameters: Mapping[str, int | float | str] = wire_field(MapOf(Scalar(), 8, key_bytes=16))
-    """What else the codec needs to be undone; empty for JPEG. ``w`` and ``h`` are the coded size where that is not
+    """Further parameters for the decoder; empty for JPEG. ``w`` and ``h`` are the coded size where that is not
     the size of the crop."""
     also: tuple[AlsoShown, ...] = wire_field(ListOf(Nested(AlsoShown), MAX_ALSO))
     """Further tracks that the same crop shows."""

@@ -36,7 +36,7 @@ _EARLY: Final = 0.95
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackStep(OfFrame):
-    """Payload of ``tracks``: what the edge's tracker listed at one frame. Boxes are in base pixels."""
+    """Payload of ``tracks``: the list of the edge's tracker at one frame. Boxes are in base pixels."""
 
     MAX_BYTES: ClassVar[int] = 16_384
     TRIMMED: ClassVar[bool] = True
@@ -98,7 +98,7 @@ class TrackStepEncoder:
         listed = _quantised(tracks, count)
         if not alone:
             return write_tracks(listed, reference=self._state, frames=frames)
-        if self._sequence >= 0:  # the same once more for what it says of velocities
+        if self._sequence >= 0:  # coded once more, only to learn the velocities
             _, state = write_tracks(listed, reference=self._state, frames=frames)
             known = {track.track_id: track for track in state}
             listed = [

@@ -152,7 +152,7 @@ def imencoded(ending: str, image_bgr: Image, flags: Sequence[int]) -> bytes:
 def imdecoded(data: bytes, *, size: tuple[int, int], what: str) -> Image:
     """BGR of ``size``; an EXIF orientation is ignored.
 
-    The caller has checked the header; `StillError` for what is wrong behind it.
+    The caller has checked the header; raises `StillError` for faults behind it.
     """
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     # It would write a line for each broken picture, and a flood of them would fill the log.

@@ -1,9 +1,9 @@
 """The H.264 headers around one coded slice (ITU-T H.264, clauses 7.3 and 9.3), so that they need not cross the link.
 
 A still is one slice of CABAC data in a stream that both sides know: High profile, one slice a picture, 4:2:0, picture
-order by decoding order. The edge cuts x264's own headers off; the ground writes these in their place. What the slice
-data hangs on is fixed here and checked at the edge (`cabac_data`); what else x264 writes (level, timing) does not
-matter to a decoder.
+order by decoding order. The edge cuts x264's own headers off; the ground writes these in their place. Header
+fields that slice data depends on are fixed here and checked at the edge (`cabac_data`); a decoder needs none of the
+others that x264 writes (level, timing).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def coded_slice(cabac: bytes, *, qp: int, intra: bool) -> bytes:
 
 
 def cabac_data(stream: bytes, *, qp: int, intra: bool) -> bytes:
-    """The CABAC data of the picture that x264 wrote, whose headers must mean what `coded_slice` writes.
+    """The CABAC data of the picture that x264 wrote, whose headers must mean the same as those of `coded_slice`.
 
     ``stream`` is Annex B with the parameter sets of this encoder in it, and the wanted slice last. Another build of
     x264 that means something else is found out here, in a RuntimeError, and not by a garbled picture at the ground.

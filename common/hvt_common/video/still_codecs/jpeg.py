@@ -22,7 +22,7 @@ _MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 class JpegCodec(IntraCodec):
     """Baseline JPEG, 4:2:0, with Huffman tables made for the picture: the paper's setting.
 
-    OpenCV with ``OPTIMIZE`` writes what Pillow writes with ``optimize=True`` at the same quality, to the byte count.
+    OpenCV with ``OPTIMIZE`` writes as many bytes as Pillow with ``optimize=True`` at the same quality.
     """
 
     name = "jpeg"

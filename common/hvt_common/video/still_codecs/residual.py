@@ -1,13 +1,13 @@
-"""`residual`: what the decoded base lacks of the crop, which both sides see alike.
+"""`residual`: the difference between the crop and the decoded base, which both sides have alike.
 
 The base crop is the reference picture of one inter-coded H.264 slice. At the edge x264 gets the base crop as its
 first picture, nearly lossless, and the source as its second; only the second's slice data crosses the link. The
 ground writes the base crop as a picture of verbatim samples (I_PCM) in front of it. So x264 chooses block by block:
 the base as it is (next to nothing), the base plus a difference, the base from a little aside, or the source anew.
 
-What the ground adds to its base crop is the decoded difference alone: where nothing was coded the result is the base,
-to the bit. All of it is arithmetic of whole numbers (docs/wire-stills.md). Another picture is found out by its
-checksum before anything is painted.
+The ground adds only the decoded difference to its base crop: where nothing was coded the result is the base,
+to the bit. All of it is arithmetic of whole numbers (docs/wire-stills.md). A checksum reveals another base before
+anything is painted.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The quality at which a crop is coded, found by trying: what fits so many bytes, or what reaches so many dB.
+"""The quality at which a crop is coded, found by trying: the best within some bytes, or the least for some PSNR.
 
 Fidelity and the logarithm of the size rise about evenly with the quality, so that each try tells where the next is
 best made; and no coding is tried twice, where a codec has fewer than a hundred (``step_of``). Codecs promise no exact
-order, only that more quality is no worse and nearly always more bytes; what is returned was tried, so it fits, or
-reaches, in any case.
+order, only that more quality is no worse and nearly always more bytes; the returned coding was tried, so it fits the
+bytes or reaches the PSNR in any case.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Not libswscale: its default rounding shifts levels by about two, and crops of odd sizes lose a column of chroma. A
 picture here is one uint8 array as FFmpeg lays out ``yuv420p``: (3/2 H, W), luma above, then Cb and Cr. H and W are
-multiples of `BLOCK_PX`; what is beyond the crop repeats its last row and column.
+multiples of `BLOCK_PX`; samples beyond the crop repeat its last row and column.
 """
 
 from __future__ import annotations
