@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 from hvt_common.protocol.clock_offset import ClockOffset
-from hvt_common.protocol.messages import BacklogHeader, BacklogKind, WireError
+from hvt_common.protocol.messages import BacklogHeader, BacklogKind, BaseHeader, Flags, WireError
 from hvt_common.transport.inbox import Received
+from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_common.video.still_codecs import StillError
 from hvt_ground.backlog.assembly import BacklogAssembly
+from hvt_ground.link.reassemble import Arrival, Reassembler
 from hvt_ground.link.reception import Reception
 from hvt_ground.perception.stills.decode import coded_size
 from rigs.messages import BACKLOG, BASE, INFO, ROI
@@ -40,8 +43,14 @@ _DIALOGUES: tuple[tuple[str, tuple[_Event, ...]], ...] = (
     ("the end comes again while it is processed", ((7, 0, 40, 40), (7, 39, 40, 40), True, (7, 0, 40, 40))),
     ("the total changes while it is processed", ((7, 0, 40, 40), (7, 0, 20, 30), True, (7, 39, 40, 40))),
     ("an unusable object", ((7, 0, 40, 40), False, (7, 0, 40, 40), True)),
-    ("the total changes", ((7, 0, 20, 40), (7, 20, 25, 30), (7, 0, 30, 30), True)),
-    ("the total changes after the end", ((7, 0, 30, 30), True, (7, 0, 20, 40), (7, 20, 40, 40), True)),
+    (
+        "the total changes",
+        ((7, 0, 15, 25), (7, 15, 20, 40), (7, 0, 20, 40), (7, 20, 25, 30), (7, 0, 30, 30), True),
+    ),
+    (
+        "the total changes after the end",
+        ((7, 0, 30, 30), True, (7, 0, 20, 40), (7, 20, 40, 40), True, (7, 0, 20, 30)),
+    ),
     ("two objects in turn", ((7, 0, 20, 40), (8, 0, 10, 10), True, (7, 20, 40, 40), True)),
     ("three of one number", ((7, 0, 20, 40), (17, 0, 10, 40), (27, 0, 15, 40), (7, 20, 40, 40), True)),
     (
@@ -66,70 +75,30 @@ _SIZES: tuple[tuple[str, tuple[int, int, int, int], tuple[int, int] | None], ...
     ("a pixel too high for one that nobody requested", (0, 0, 100, 513), None),
     ("of another shape by just as much as may be", (0, 0, 100, 50), (52, 25)),
     ("of another shape by a little more", (0, 0, 100, 50), (53, 25)),
+    ("of another shape by just as much as may be, upright", (0, 0, 50, 100), (25, 52)),
 )
 
-_REPORT = "report"
-_TRACES: tuple[tuple[str, tuple[tuple[str, int, int, float | None], ...]], ...] = (
-    ("nothing yet", ((_REPORT, 0, 0, None),)),
-    (
-        "all arrives",
-        (("base", 0, 0, 20.5), ("still", 0, 5, None), ("base", 1, 40, 21.5), (_REPORT, 0, 47, None)),
-    ),
+_TRACES = (
+    ("nothing yet", "report@0"),
+    ("all arrives", "base0@0+20.5 still0@5 base1@40+21.5 report@47"),
     (
         "two stills are missing, one comes again, one with the backlog",
-        (
-            *(("base", 0, 0, None), ("still", 0, 5, None), ("still", 3, 9, None), (_REPORT, 0, 10, None)),
-            *(
-                ("still", 1, 15, None),
-                (_REPORT, 0, 20, None),
-                ("stored", 2, 30, None),
-                (_REPORT, 0, 40, None),
-            ),
-        ),
+        "base0@0 still0@5 still3@9 report@10 stored2147483648@11 still1@15 report@20 stored2@30 report@40",
     ),
     (
         "a ground that comes later misses nothing that was before it",
-        (
-            *(("base", 50, 0, None), ("still", 40, 5, None), (_REPORT, 0, 10, None)),
-            *(("still", 42, 15, None), (_REPORT, 0, 20, None)),
-        ),
+        "base50@0 still40@5 report@10 still42@15 report@20",
     ),
-    (
-        "one that was there from the start does",
-        (("base", 0, 0, None), ("still", 2, 5, None), (_REPORT, 0, 9, None)),
-    ),
-    (
-        "a still is missed for six seconds",
-        (
-            *(("still", 7, 0, None), ("still", 9, 100, None)),
-            *((_REPORT, 0, 6_100, None), (_REPORT, 0, 6_101, None)),
-        ),
-    ),
-    (
-        "of many the newest are named",
-        (
-            *(("still", 0, 0, None), ("still", 100, 5, None), (_REPORT, 0, 6, None)),
-            *(("still", 105, 7, None), (_REPORT, 0, 8, None)),
-        ),
-    ),
+    ("one that was there from the start does", "base0@0 still2@5 report@9"),
+    ("a still is missed for six seconds", "still7@0 still9@100 report@6100 report@6101"),
+    ("of many the newest are named", "still0@0 still100@5 report@6 still105@7 report@8"),
     (
         "the highest counts, and when it came",
-        (
-            ("base", 3, 0, None),
-            ("base", 5, 10, None),
-            ("base", 5, 15, None),
-            ("base", 4, 20, None),
-            ("still", 4, 21, None),
-            ("still", 3, 22, None),
-            (_REPORT, 0, 30, None),
-        ),
+        "base3@0 base5@10 base5@15 base4@20 still4@21 still3@22 report@30",
     ),
     (
         "the median of the delays since the last report",
-        (
-            *(("base", 0, 0, 9.5), ("base", 1, 1, 4.5), ("base", 2, 2, 6.0), (_REPORT, 0, 3, None)),
-            *(("base", 3, 4, 5.0), ("base", 4, 5, 8.0), (_REPORT, 0, 6, None), (_REPORT, 0, 7, None)),
-        ),
+        "base0@0+19.5 base1@1+4.5 base2@2+6.0 report@3 base3@4+5.0 base4@5+8.0 report@6 report@7",
     ),
 )
 """What came, its number, when in ms, its delay."""
@@ -138,16 +107,56 @@ _OTHERS |= {"clock_error_ns": -1, "backlog": ()}
 """Fields of a report that others fill."""
 
 
+_ORDERS = (
+    ("all arrives", "0K 1 2 3K 4"),
+    ("a reader that comes later", "7 8 9K 10"),
+    ("one is lost", "0K 1 3 4 5K 6"),
+    ("two are lost before a keyframe", "0K 3K 4"),
+    ("some come twice", "0K 1 1 0K 2 3K 3K 4"),
+    ("some come twice while a keyframe is waited for", "0K 1 3 0K 1 3 4K 5"),
+    ("what was lost comes late", "0K 1 3 2 4 5K 6 4 7"),
+    ("damage", "0K 1! 2 3K 4 5K! 6 7K 8"),
+    ("the edge starts again", "0K 1 2 +0 +1K +2 3 0K +3"),
+)
+"""Numbers on ``base``, a second apart, so that nobody waits for what is missing: K a keyframe, ! damaged, + of the
+next session."""
+
+
+def base_orders() -> Iterator[dict[str, Any]]:
+    """Messages of ``base`` in the order in which they come, each with whether a decoder gets it."""
+    for name, script in _ORDERS:
+        stream, steps, arrivals = Reassembler[int](), [], list[Arrival[int]]()
+        for at, word in enumerate(script.split()):
+            number = int(word.strip("+K!"))
+            header = replace(
+                BASE,
+                session_id=_SESSION + word.count("+"),
+                sequence=number,
+                frame_index=2 * number,
+                flags=64 + int(Flags.KEYFRAME) * word.count("K"),
+            )
+            data, payload = header.pack(_DATA[:4]), _DATA[word.count("!") : 4]
+            steps.append({"hex": data.hex(), "payload": payload.hex(), "decode": False})
+            arrivals += stream.overdue(now_ns=at * SECOND_NS)
+            try:
+                arrivals += stream.accept(BaseHeader.parse(data, payload), at, now_ns=at * SECOND_NS)
+            except WireError:
+                stream.corrupt()
+        for one in arrivals:
+            steps[one.message]["decode"] = one.verdict == "decode"
+        yield {"session": name, "steps": steps}
+
+
 def report_traces() -> Iterator[dict[str, Any]]:
     """What came and when, and the fields of the reports between."""
-    for name, events in _TRACES:
-        timed = any(delay_ms is not None for *_, delay_ms in events)
-        info = replace(INFO, pace="realtime" if timed else "lockstep")  # in which no delay is known
+    for name, script in _TRACES:
+        info = replace(INFO, pace="realtime" if "+" in script else "lockstep")  # in which no delay is known
         counted = Reception(info, clock=int, edge_clock=ClockOffset(), emit=lambda _event: None)
         steps: list[dict[str, Any]] = []
-        for kind, number, at_ms, delay_ms in events:
+        for kind, number, at, delay in re.findall(r"([a-z]+)(\d*)@(\d+)\+?(\S*)", script):
+            at_ms = int(at)
             at_ns = at_ms * 1_000_000
-            if kind == _REPORT:
+            if kind == "report":
                 said = counted.feedback(send_ns=at_ns, **_OTHERS)
                 steps.append(
                     {
@@ -160,17 +169,15 @@ def report_traces() -> Iterator[dict[str, Any]]:
                     }
                 )
                 continue
-            steps.append(
-                {kind: number, "at_ms": at_ms} | ({} if delay_ms is None else {"delay_ms": delay_ms})
-            )
+            steps.append({kind: int(number), "at_ms": at_ms} | ({"delay_ms": float(delay)} if delay else {}))
             item = Received("", b"", b"", "", at_ns)
             if kind == "base":
-                captured_ns = at_ns - round(1_000_000 * (delay_ms or 0.0))
-                counted.base(replace(BASE, sequence=number, capture_ns=captured_ns), item)
+                captured_ns = at_ns - round(1_000_000 * float(delay or 0))
+                counted.base(replace(BASE, sequence=int(number), capture_ns=captured_ns), item)
             elif kind == "still":
-                counted.still(replace(ROI, sequence=number), item)
+                counted.still(replace(ROI, sequence=int(number)), item)
             else:
-                header = replace(BACKLOG, session_id=INFO.session_id, number=number)
+                header = replace(BACKLOG, session_id=INFO.session_id, number=int(number))
                 counted.backlog(header, item, delivered=True)
         yield {"session": name, "steps": steps}
 
@@ -215,7 +222,7 @@ def still_sizes() -> Iterator[dict[str, Any]]:
     """A still whose header says where it is and how large it was coded: read or refused undecoded."""
     view = View(_SOURCE, (1000, 750), 0.25, (0.0, 0.0))
     for what, crop, size in _SIZES:
-        parameters = ({} if "nobody" in what else {"ask": 1}) | (
+        parameters = ({} if "nobody" in what else {"ask": 0}) | (
             {} if size is None else {"w": size[0], "h": size[1]}
         )
         x1, y1, x2, y2 = map(float, crop)

@@ -819,6 +819,26 @@ class BacklogReader {
   }
 }
 
+// ---- The order of the base stream -------------------------------------------------------------------------------
+
+class Order {
+  private session: Value = null; private next = 0; private waits = true;
+  private ended = new Set<Value>();
+
+  // Whether a decoder gets it.
+  take(data: Uint8Array, payload: Uint8Array): boolean {
+    if (refusal(() => read("BaseHeader", data, payload))) return false;
+    const values = read("BaseHeader", data, payload);
+    const [session, sequence, , , , flags] = values as bigint[];
+    if (this.ended.has(session)) return false;
+    if (session !== this.session) [this.session, this.next, this.waits] = [this.ended.add(this.session) && session, 0, true];
+    if (sequence < this.next) return false;
+    this.waits = (flags & 1n) === 0n && (this.waits || sequence > this.next);
+    this.next = Number(sequence) + 1;
+    return !this.waits;
+  }
+}
+
 // ---- Reports ----------------------------------------------------------------------------------------------------
 
 class Report {
@@ -928,6 +948,12 @@ const CHECKS: Record<string, (vector: any) => string | undefined> = {
       const why = refusal(() => (became = data === undefined ? reader.settle(usable) : reader.take(unhex(data), unhex(payload))));
       if (!!why !== !!refused || (!why && canonical(became) !== canonical(expected))) return `step ${number}: ${canonical(became)}`;
     }
+    return undefined;
+  },
+  "base-orders.json": (vector) => {
+    const reader = new Order();
+    for (const [number, step] of vector.steps.entries())
+      if (reader.take(unhex(step.hex), unhex(step.payload)) !== step.decode) return `step ${number}: not ${step.decode}`;
     return undefined;
   },
   "report-traces.json": (vector) => {

@@ -84,7 +84,7 @@ def track_sessions() -> Iterator[tuple[str, list[Step]]]:
             ),
             (90, True, [0, 0, 1, 0, 0, 0, 9, -9]),
             (2000, True, [0, 0, 0, 0]),
-            (2300, True, [1, 0, 0, 1, -1, 1, 0, 0, 0, 0, 0, 5, 5]),
+            (2192, True, [1, 0, 0, 1, -1, 1, 0, 0, 0, 0, 0, 5, 5]),
         ],
     )
     yield (
@@ -152,11 +152,14 @@ def whole_pose(
     pitch: int = 0,
     roll: int = 0,
     field: int | None = None,
+    height: int | None = None,
 ) -> BitWriter:
-    """A report that stands by itself: place, the camera where it has a yaw, field of view, and errors of 4."""
-    there = (yaw is not None) << 2 | (field is not None)
+    """A report that stands by itself: place, the camera where it has a yaw, and so on, and errors of 4."""
+    there = (height is not None) << 4 | (yaw is not None) << 2 | (field is not None)
     out = BitWriter().u(1, 1).u(number, 4).u(time_ms, 42).u(there, 5)
     out.u(place[0] + 900_000_000, 31).u(place[1] + 1_800_000_000, 32)
+    if height is not None:
+        out.u(height + 10_000, 20)
     if yaw is not None:
         out.u(yaw, 12).u(pitch + 900, 11).u(roll + 1800, 12)
     if field is not None:
@@ -171,11 +174,14 @@ def pose_changes(
     place: Sequence[int] = (0, 0),
     camera: Sequence[int] = (),
     errors: int = 0,
+    height: int | None = None,
 ) -> BitWriter:
     """A report that builds on the one before; ``time_ms`` later."""
     out = BitWriter().u(0, 1).u(number, 4).se(time_ms - 1000, 4)
     for change in place:
         out.se(change, 5)
+    if height is not None:
+        out.se(height, 2)
     for change in camera:
         out.se(change, 3)
     for _ in range(3):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,8 @@ def track_steps() -> Iterator[dict[str, Any]]:
     """Sessions of steps, each with the list that it leaves; damaged ones leave that of the step before."""
     for name, count, steps in (("three cars", 3, 8), ("a crowd", 60, 6), ("nobody", 0, 3)):
         yield {"session": name, "steps": list(_session(count, steps))}
-    yield {"session": "the edge starts again", "steps": [*_session(3, 3), *_session(3, 2, session_id=7)]}
+    again = _session(3, 2, session_id=2**63 + 6)  # of the same float
+    yield {"session": "the edge starts again", "steps": [*_session(3, 3), *again]}
     yield {"session": "damaged steps", "steps": list(_damaged())}
     for name, script in track_sessions():
         yield {"session": name, "steps": list(_scripted(script))}
@@ -133,19 +134,7 @@ def _read(step: TrackStep, state: list[CodedTrack], *, before: int) -> list[Code
 
 
 def _rows(state: list[CodedTrack]) -> list[dict[str, int]]:
-    return [
-        dict(
-            zip(
-                _TRACK,
-                (
-                    *(one.track_id, one.class_id, one.confidence, one.x, one.y, one.width, one.height),
-                    *(one.velocity_x, one.velocity_y, one.scale_x, one.scale_y, one.missed),
-                ),
-                strict=True,
-            )
-        )
-        for one in state
-    ]
+    return [dict(zip(_TRACK, astuple(one), strict=True)) for one in state]
 
 
 def poses() -> Iterator[dict[str, Any]]:
@@ -224,6 +213,9 @@ def _pose_scripts() -> dict[str, list[BitWriter]]:
             *(pose_changes(1, errors=more) for more in (28, 27)),
             *steep,
             *(whole_pose(3, 3000, place, yaw=0, roll=roll) for roll in (-1800, 1799, 1800)),
+            *(whole_pose(4, 4000, (900_000_000, 5), height=height) for height in (1_000_001, 1_000_000)),
+            *(pose_changes(5, place=(north, 0), height=0) for north in (1, -1)),
+            *(pose_changes(6, height=higher) for higher in (1, 0)),
         ],
         "time goes on": [
             whole_pose(3, 5000, place),

@@ -75,25 +75,17 @@ def still_cases() -> Iterator[dict[str, Any]]:
         }
     for what, payload in (("a QP of 52", "3401"), ("no data", "20"), ("nothing", "")):
         yield {"what": what, "size": (16, 16), "payload": payload, "becomes": "refused"}
-    planes, noise = _base_planes(), _noise_planes()
+    planes, noise, odd = _base_planes(), _noise_planes(), (-98305 / 65536, -16391 / 65536)
     for what, base_planes, crop, size, scale, offset, change, becomes in (
         ("the base that it was coded on", planes, (0, 0, 64, 64), (16, 16), 1.0, (0.0, 0.0), 0, "read"),
+        ("a larger number for it", planes, (0, 0, 64, 64), (16, 16), 1.0, (0.0, 0.0), 5 << 16, "read"),
         ("another base", planes, (0, 0, 64, 64), (16, 16), 1.0, (0.0, 0.0), 1, "again"),
         ("32 samples a pixel", planes, (0, 0, 512, 512), (16, 16), 1.0, (0.0, 0.0), 0, "read"),
         ("33 samples a pixel", planes, (0, 0, 528, 528), (16, 16), 1.0, (0.0, 0.0), 0, "refused"),
         ("any colours, up to the far corner", noise, (36, 24, 64, 48), (28, 24), 1.0, (0.0, 0.0), 0, "read"),
-        ("enlarged beyond all sides", noise, (0, 0, 190, 150), (190, 150), 0.37, (-1.5, 2.25), 0, "read"),
+        ("enlarged beyond all sides", noise, (0, 0, 190, 150), (190, 150), 0.3701, odd, 0, "read"),
         ("at and beside a half", noise, (8, 8, 24, 24), (16, 16), 1.0, (1 / 64, 1023 / 65536), 0, "read"),
-        (
-            "a little more than a sample",
-            noise,
-            (8, 8, 24, 24),
-            (16, 16),
-            65537 / 65536,
-            (0.0, 0.0),
-            0,
-            "read",
-        ),
+        ("a little more than a sample", noise, (8, 8, 24, 24), (16, 16), 1 + 2**-16, (0.0, 0.0), 0, "read"),
         ("shrunk to odd sides", noise, (5, 3, 64, 46), (41, 29), 1.0, (0.5, 0.25), 0, "read"),
     ):
         view = View(crop[2:], _BASE, scale, offset)

@@ -33,7 +33,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.protocol.messages.envelope import DEEPEST, MOST_UNKNOWN_FIELDS, WIRE_VERSION
 from hvt_ground.backlog.assembly import backlog_content
-from lab.conformance.dialogues import backlog_dialogues, report_traces, still_sizes
+from lab.conformance.dialogues import backlog_dialogues, base_orders, report_traces, still_sizes
 from lab.conformance.schema import PATH, name_of, schema
 from lab.conformance.sessions import poses, track_steps
 from lab.conformance.stills import still_cases
@@ -61,6 +61,7 @@ def files() -> dict[str, str]:
         "track-steps.json": list(track_steps()),
         "poses.json": list(poses()),
         "still-cases.json": [*still_cases(), *still_sizes()],
+        "base-orders.json": list(base_orders()),
         "backlog-dialogues.json": list(backlog_dialogues()),
         "report-traces.json": list(report_traces()),
     }
@@ -266,8 +267,8 @@ def _of_other_minors(message: Message) -> Iterator[dict[str, Any]]:
         yield _vector(replace(message, **optional), "without what was added since", fewer)
 
 
-def _with_nested(values: list[Any], place: int, raw: Any) -> list[Any]:
-    return [*values[:place], [[*one, raw] for one in values[place]], *values[place + 1 :]]
+def _with_nested(values: list[Any], place: int, *raw: Any) -> list[Any]:
+    return [*values[:place], [[*one, *raw] for one in values[place]], *values[place + 1 :]]
 
 
 def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str, Any]:
@@ -309,6 +310,8 @@ def _good_envelopes() -> Iterator[dict[str, Any]]:
     values = msgpack.unpackb(BASE.pack())[:-1]
     spare_bytes = BaseHeader.MAX_BYTES - len(BASE.pack()) - 2
     payload = _PAYLOADS[BaseHeader]
+    wide = _Coded(b"\xcd" + WIRE_VERSION.to_bytes(2, "big"))
+    yield _vector(BASE, "its version in 16 bits", _packed([wide, *values[1:]], payload))
     yield _vector(BASE, "as long as a message may be", _packed([*values, bytes(spare_bytes)], payload))
     deepest = _nested(DEEPEST - 1)
     yield _vector(BASE, "an unknown field as deep as may be", _packed([*values, deepest], payload))
@@ -356,6 +359,7 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
         ("an unknown map whose key is a number", {1: 2}),
         ("an unknown field of a type of its own", msgpack.ExtType(5, b"x")),
         ("an unknown field of a type of its own without bytes", msgpack.ExtType(5, b"")),
+        ("an unknown field of a type that never was", _Coded(b"\xc1")),
     ):
         yield _bad(BASE, what, _packed([*values, unknown], payload), payload)
     for what, nested in _long_heads(DEEPEST):
@@ -445,8 +449,12 @@ def _refused() -> Iterator[dict[str, Any]]:
             yield _bad(message, f"{what} version", _packed([version, *values[1:]], payload), payload)
         if name_of(type(message)) in _WITH_NESTED:
             name, place = _WITH_NESTED[name_of(type(message))]
-            deeper = _packed(_with_nested(values, place, _nested(DEEPEST - 2)), payload)
-            yield _bad(message, f"an unknown field too deep in each of {name}", deeper, payload)
+            for what, raw in (
+                ("an unknown field too deep", [_nested(DEEPEST - 2)]),
+                ("more unknown fields than are skipped", [0] * (MOST_UNKNOWN_FIELDS + 1)),
+            ):
+                longer = _packed(_with_nested(values, place, *raw), payload)
+                yield _bad(message, f"{what} in each of {name}", longer, payload)
         unknown = [0] * (MOST_UNKNOWN_FIELDS + 1)
         yield _bad(
             message, "more unknown fields than are skipped", _packed([*values, *unknown], payload), payload
