@@ -1,4 +1,4 @@
-"""The ground side: what edges send over the link becomes tracks, tables and recordings; `app.Ground` is all of it.
+"""The ground side turns messages of edges into tracks, tables and recordings; `app.Ground` is all of it.
 
 A program that wants the pictures, tracks and stills itself uses `listen`, see docs/library.md.
 """

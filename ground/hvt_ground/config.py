@@ -20,8 +20,8 @@ DETECTOR, NONE, MOTION = "detector", "none", "motion"
 
 
 Written = tuple[str, Path, str]
-"""What is written: the option that names it, the path, and its suffix, with which it is a file, and without which a
-folder that gets one for each session. Without a suffix it is always a file."""
+"""An output: the option that names it, the path, and its suffix. A path with that suffix is a file, another one
+a folder with a file for each session. Where the suffix is empty the path is always a file."""
 
 _LIMIT = SettingType("LIMIT", parse_limit)
 

@@ -6,7 +6,7 @@
         crop = edges["uav-1"].still(track=17, at_s=-3)
         crop.save("crop.png")
 
-It connects to a ground or to a router, which pass on what is asked and what is answered, so that a still crosses the
+It connects to a ground or to a router, which pass on questions and answers, so that a still crosses the
 link of the edge once. An edge that listens itself can be connected to as well; its stills then cross its link twice
 while one is waited for.
 """
@@ -132,7 +132,7 @@ class Requester:
 
 
 def _link_hint(session: zenoh.Session) -> str:
-    # By its key, what stands at the other end; empty without keys. An asker has one link.
+    # Names the other end by its key; empty without keys. An asker has one link.
     names = sorted({link.auth_identifier for link in session.info.links() if link.auth_identifier})
     if not names:
         return ""

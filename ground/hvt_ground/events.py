@@ -73,7 +73,7 @@ class PoseUpdate:
 class Overlay:
     """The ground's tracks at one frame, as parallel arrays ordered by track id.
 
-    A frame that the base stream left out may have one too: what the edge reported, and the others predicted.
+    A frame that the base stream left out may have one too: tracks that the edge reported, and predictions of others.
     """
 
     frame_index: int

@@ -1,6 +1,6 @@
 """The door for extras: packages that bring settings, sinks, checks and kinds of export of their own.
 
-An extra is what an entry point of the group ``hvt.ground`` names, see `Extra`. It may use all of the
+An extra is an `Extra` that an entry point of the group ``hvt.ground`` names. It may use all of the
 ground. The ground imports none, and runs the same where one is absent.
 """
 
@@ -58,7 +58,7 @@ class Flight:
 
     info: Info
     locator: Locator
-    """What places its tracks."""
+    """Gives its tracks places on the map."""
     clock: Callable[[], int]
     """The ground's steady clock, nanoseconds."""
     new_file: NewFile
@@ -82,7 +82,7 @@ OpenSinks = Callable[[Flight], Iterable[Opening]]
 
 
 class Service:
-    """What an extra does for a whole run of a ground: a context, from before the link is open until after its end."""
+    """An extra's context around a whole run of a ground: it begins before the link opens and ends after it closes."""
 
     links: Sequence[str] = ()
     """Where somebody can watch."""
@@ -131,11 +131,11 @@ class Extra(Generic[Options]):
         return ()
 
     def writes(self, config: Options) -> Iterable[Written]:  # noqa: ARG002
-        """What it writes; no addresses. The ground looks whether that can be, and makes folders."""
+        """Its output files; no addresses. The ground checks that they can be written, and makes folders."""
         return ()
 
     def check_outputs(self, config: Options) -> None:
-        """Raise `UserError` if it could not send, or make, what is requested."""
+        """Raise `UserError` if it could not send or make a requested output."""
 
     def checks(self, config: Options) -> Mapping[str, Callable[[], Finding]]:  # noqa: ARG002
         """Its checks in ``hvt-ground doctor``, by name."""
@@ -148,7 +148,7 @@ class Extra(Generic[Options]):
         clock: Callable[[], int],  # noqa: ARG002
         failures: Failures,  # noqa: ARG002
     ) -> Service | None:
-        """What it does for one whole run by the ground's ``clock``; `UserError` where it cannot."""
+        """Its `Service` for one whole run by the ground's ``clock``; `UserError` where it cannot start."""
         return None
 
     def start(self, config: Options, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
@@ -156,7 +156,7 @@ class Extra(Generic[Options]):
         return lambda _flight: ()
 
     def locators(self, terrain: Path | None) -> Callable[[str], Locator] | None:  # noqa: ARG002
-        """What places the flight of an edge, by its name, on an elevation model or flat ground; here nothing."""
+        """A maker of `Locator`s by the name of an edge, on an elevation model or flat ground; None without one."""
         return None
 
 
@@ -185,7 +185,7 @@ def config_class(extras: tuple[Extra[Any], ...] | None = None) -> type[GroundCon
 
 
 def locators(terrain: Path | None) -> Callable[[str], Locator]:
-    """What places the flight of an edge, by the edge's name; `UserError` for a model without the extra for it."""
+    """A maker of `Locator`s by the name of an edge; `UserError` for an elevation model without the extra for it."""
     from hvt_ground.poses import NOWHERE  # noqa: PLC0415 - ``--help`` is to load no numpy
 
     for extra in all_extras():

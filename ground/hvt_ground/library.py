@@ -57,7 +57,7 @@ join_threads_at_exit()
 def listen(**settings: object) -> Listening:
     """A ground with the settings of ``hvt-ground`` (docs/options.md), such as ``listen="tcp/0.0.0.0:7447"``.
 
-    Names have underscores for dashes; what may be given several times takes a list, and a switch True or False.
+    Names have underscores for dashes; an option that may be repeated takes a list, and a switch True or False.
     Nothing is recorded unless ``record`` says so. Raises `UserError` where a setting is unknown or wrong.
     """
     words = settings_words({"quiet": True, **settings})
@@ -148,7 +148,7 @@ class _Queue(SinkWriter[Event]):
         self._events = events
         self._stop = stop
         self._info = info
-        # What was stored is another stretch of the stream than what is live.
+        # Stored units are another stretch of the stream than live ones.
         self._decoders = {stored: BaseDecoder(size=info.base_size) for stored in (False, True)}
         self._awaits_keyframe = {False: True, True: True}
 

@@ -1,4 +1,4 @@
-"""The poses of one session, the pose of a moment between or shortly after them, and what an extra places by it."""
+"""The poses of one session, the pose of a moment between or shortly after them, and places that an extra derives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STALE_S: Final = 10.0
 _MOST_POSES: Final = 64
 """A minute of them: pictures are not shown later than that."""
 _ANEW_AFTER: Final = 5
-"""What comes so often and is never newer begins anew: the newest may be forged, or the edge's clock set back."""
+"""After so many poses without a newer one they begin anew: the newest may be forged, or the edge's clock set back."""
 _DRIFT: Final = 0.5
 """Standard deviation of a change of motion, as a share of the motion in as long a time."""
 
@@ -56,7 +56,7 @@ class PoseTrail:
         """The pose of a moment; None where the nearest before it is stale.
 
         Between two it is on the line from one to the other. After the last one it goes on as it did before, and its
-        errors grow with what that may be wrong by.
+        errors grow with the time since.
         """
         poses = self._poses
         after = bisect_right(self._times, capture_ns)

@@ -59,7 +59,7 @@ class _Open:
 class BacklogAssembly:
     """Assembles the chunks of one edge. Not safe for threads.
 
-    At most ``max_objects`` are in progress. ``max_bytes`` bounds them and what is handed out and not settled yet,
+    At most ``max_objects`` are in progress. ``max_bytes`` bounds them and delivered ones that are not settled yet,
     and holds one object of the largest size. ``remember`` delivered objects are known again.
     """
 

@@ -51,7 +51,7 @@ _OPEN_S = 0.5
 class EdgeBacklog:
     """Of one edge. `chunk` is for the receiving thread, `take_acknowledged_ranges` for any.
 
-    ``recordings`` takes what is of another session; None refuses it.
+    ``recordings`` takes objects of other sessions; None refuses them.
     """
 
     def __init__(self, edge: str, *, recordings: BacklogRecordings | None) -> None:

@@ -48,7 +48,7 @@ class BacklogTotals:
     def add(
         self, *, stills: int = 0, frames: int = 0, video_s: float = 0.0, at: tuple[int, int] | None = None
     ) -> None:
-        """Count what came, or less than nothing where it was lost: it is sent again."""
+        """Count stored objects that came, or negative numbers for lost ones: they are sent again."""
         self.stills += stills
         self.frames += frames
         self.video_s += video_s
@@ -66,7 +66,7 @@ class LateStills:
     """Stored stills name the tracks of stored video: each the one whose box it shows at its frame.
 
     For one session and one thread. Stills come before the boxes of their frame, and before its ``tilt`` is known.
-    What speaks for a track outweighs that its stills had none; ``scale`` is base pixels per source pixel.
+    A still that matches a track outweighs others that matched none; ``scale`` is base pixels per source pixel.
     """
 
     def __init__(self, tilt: ViewTilt, *, scale: float) -> None:
@@ -153,7 +153,7 @@ class SessionBacklog:
         self.video.live(frame_index, data, keyframe=keyframe, after_gap=after_gap)
 
     def able(self) -> bool:
-        """Whether what is logged now will be written. Otherwise it must come again: the edge would forget it."""
+        """Whether an object logged now will be written. Otherwise it must come again: the edge would forget it."""
         return all(one.is_open() for one in self._outputs)
 
     def is_new_still(self, sequence: int) -> bool:

@@ -8,11 +8,12 @@ Four things are decided here:
 
 *Reordering.* Zenoh keeps the order of a key on one link; on several links a unit may come late. A hole counts as lost
 when it is twice as old as any was whose unit came late: at once where none of `ORDERLY_UNITS` was. At most
-`REORDER_WAIT_NS`, and `REORDER_UNITS` units, are waited for. A keyframe never waits: what is missing before it no
-longer matters.
+`REORDER_WAIT_NS`, and `REORDER_UNITS` units, are waited for. A keyframe never waits: units missing before it no
+longer matter.
 
-*Repair.* An edge that is told what is `missing` sends it again. A hole waits for that, and where it does not come in
-the time that it usually takes, at first a round trip and some, for a keyframe as well: whichever is first (`Repair`).
+*Repair.* An edge sends units again that a report calls `missing`. A hole waits for that, and where it does not come
+in the time that it usually takes, at first a round trip and some, for a keyframe as well: whichever is first
+(`Repair`).
 
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
@@ -40,7 +41,7 @@ from hvt_common.units import SECOND_NS
 T = TypeVar("T")
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
 """What to do with an access unit. skip: fresh, but a unit before it is lost, or no keyframe has come yet;
-stale: older than what was given up or shown; foreign: of a session that is not the present one; implausible:
+stale: older than a unit that was given up or shown; foreign: of a session that is not the present one; implausible:
 its numbers cannot be true."""
 
 REORDER_UNITS = 2
@@ -48,7 +49,7 @@ REORDER_WAIT_NS = 100_000_000
 RESEND_UNITS, RESEND_WAIT_NS = 24, 700_000_000
 """So many units, and so long, wait at most behind a hole that the edge was told of."""
 _SLACK_NS = 120_000_000
-"""Beyond the round trip, for the first: a resent unit waits behind what the link already holds."""
+"""Beyond the round trip, for the first: a resent unit waits behind the bytes that the link already holds."""
 _MOST_INTERVAL_NS, _MOST_HOLE_NS = 160_000_000, 210_000_000
 """From one unit to the next, and of all of a hole: more would be more of a second's bytes than are sent again."""
 _UNANSWERED, _UNANSWERED_NS, _MOST_UNANSWERED_NS = 3, 20_000_000_000, 640_000_000_000
@@ -91,7 +92,7 @@ class Arrival(Generic[T]):
 
 @dataclass(slots=True)
 class StreamCounters:
-    """Counts of one session, and of what came between it and the one before."""
+    """Counts of one session, and of units that came between it and the one before."""
 
     gaps: int = 0
     """Holes in the sequence that were given up."""
@@ -108,7 +109,7 @@ class StreamCounters:
 
 
 class Repair:
-    """Whether a hole is worth a wait for what the edge sends again, and how long.
+    """Whether a hole is worth a wait for the edge to send it again, and how long.
 
     It is not where the edge has no room to fill it, where the round trip is too long, nor on a link where nothing
     came again of late: a keyframe, which a hole costs otherwise, would only be later.
@@ -116,7 +117,7 @@ class Repair:
 
     def __init__(self) -> None:
         self.round_trip_ns: int | None = None
-        """To the edge and back; None where nobody tells it what is missing."""
+        """To the edge and back; None where nobody reports missing units to it."""
         self.begin(0, 0)
 
     def begin(self, sequence: int, now_ns: int) -> None:
@@ -298,7 +299,7 @@ class Reassembler(Generic[T]):
     # Within the session: a hole waits, then is given up.
 
     def overdue(self, *, now_ns: int) -> list[Arrival[T]]:
-        """What need not wait any longer behind a hole, where at most `REORDER_UNITS` units do, or `RESEND_UNITS`."""
+        """Units that need not wait any longer behind a hole: at most `REORDER_UNITS` wait, or `RESEND_UNITS`."""
         released: list[Arrival[T]] = []
         keyframe = max(
             (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1

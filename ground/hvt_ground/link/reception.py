@@ -1,6 +1,6 @@
-"""What came of a session: bytes, order, clocks, counts; and the figures of the receiver report.
+"""The account of one session: bytes, order, clocks, counts; and the figures of the receiver report.
 
-Reports cost the way back: they come so often that together they take `_SHARE` of what arrives, within bounds, and
+Reports cost the way back: their rate is such that they take `_SHARE` of the arriving bytes, within bounds, and
 only when something new has arrived; in a pause the usual ones, twice a second, go on.
 """
 
@@ -57,16 +57,16 @@ _NEAR_STILLS = 256
 _MISSED_NS = 6 * SECOND_NS
 """A still that has not come for so long does not come any more: reports need not name it for ever."""
 _ANEW_NS = 5 * SECOND_NS
-"""What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
+"""Numbers that have to rise may begin anew after so long without a newer one: the high ones may have been forged."""
 _LATELY_NS, _FRAMES_LATELY = 3 * SECOND_NS, 4
-"""What came longer ago, and so many frames, says nothing of now."""
+"""A message that came longer ago, and so many frames ago, tells nothing of now."""
 _MOST_OBJECTS = 65_535
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
 
 class Reception:
-    """All that is received and counted of one session, what it amounts to, and what is to be reported of it.
+    """Counts all received messages of one session, sums them up, and makes the receiver report.
 
     ``clock`` is Unix nanoseconds without steps, like the ``now_ns`` and ``received_ns`` of all calls; ``emit`` takes
     the events, ``note`` a line for the recording's log. Messages are for one thread; another may report, and add
@@ -92,7 +92,7 @@ class Reception:
         self.capture_clock, self.pose_clock = CaptureClock(edge_clock), CaptureClock(edge_clock)
         """Of the camera and of the source of poses."""
         self.counters = StreamCounters()
-        """What the reassembly counted since the session before."""
+        """Counts of the reassembly since the session before."""
         self.sequences = StillSequenceWindow()
         self.frames = self.stills = self.steps = 0
         """Received; the last are reports of the edge's tracks."""
@@ -102,11 +102,11 @@ class Reception:
         """Its capture time, the edge's clock; 0 before the first."""
         self.last_status: Status | None = None
         self.levers = ""
-        """What the edge last said that it sends beside the video, and why."""
+        """The edge's newest word on what ``auto`` sends beside the video, with the reasons."""
         self.edge_failing: Mapping[str, int] = {}
         """Since when each part of the edge fails, by its clock: a report has the newest try."""
         self.analyzed = (-1, -1)
-        """The last frame that was analyzed, and what was detected by then: reports want both of one moment."""
+        """The last analyzed frame, and the number of objects detected by then: reports need both of one moment."""
         self._first_capture_ns = 0
         self._info = info
         self._keys = EdgeKeys(info.edge)
@@ -121,7 +121,7 @@ class Reception:
         """Of all below."""
         self._base_sequence = self._still_sequence = self._last_still = -1
         self._missing_base: tuple[int, ...] = ()
-        """What the newest of ``base`` wait for."""
+        """Sequences that the newest units of ``base`` wait for."""
         self._from_start = False
         self._missing: Newest[int, int] = Newest(MAX_MISSING_STILLS)
         """Sequence → when it was first missed."""
@@ -133,7 +133,7 @@ class Reception:
         self._news = False
         self._reported_ns: int | None = None
 
-    # What the receiving thread brings
+    # From the receiving thread
 
     def base(self, header: BaseHeader, item: Received) -> None:
         at_ns = item.received_ns  # its own, also where it waited behind a hole
@@ -155,10 +155,10 @@ class Reception:
             self._arrive(item)
 
     def note_held(self, missing: tuple[int, ...], newest: BaseHeader | None, *, at_ns: int) -> bool:
-        """Access units wait behind what is ``missing``, ``newest`` since ``at_ns``; whether to report that at once.
+        """Access units wait behind ``missing`` ones, ``newest`` since ``at_ns``; whether to report that at once.
 
-        They count as received: until its frames do, the edge holds the next ones. It takes what is up to the newest
-        and not missing for received, too.
+        They count as received: until its frames do, the edge holds the next ones. The edge takes all units up to the
+        newest that are not missing for received, too.
         """
         with self._lock:
             news = not set(missing) <= set(self._missing_base)
@@ -300,7 +300,7 @@ class Reception:
                 "known",
             )
 
-    # What is known of it
+    # Its state
 
     @property
     def knows_delay(self) -> bool:
@@ -343,7 +343,7 @@ class Reception:
             return None
         return self.last_status.health
 
-    # What is to be reported
+    # Reports
 
     def add_results(self, results: Iterable[StillResult]) -> None:
         """Of stills that were read."""
@@ -356,7 +356,7 @@ class Reception:
             return tuple(self._results.popleft() for _ in range(min(most, len(self._results))))
 
     def due(self, now_ns: int) -> bool:
-        """Whether a report should go out: as often as what has arrived is worth it."""
+        """Whether a report should go out: the more bytes arrived, the more often."""
         with self._lock:
             if self._reported_ns is None:
                 return True
@@ -368,7 +368,7 @@ class Reception:
             return arriving > 0 and since_ns >= max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving)))
 
     def feedback(self, *, send_ns: int, **of_receiver: Any) -> Feedback:
-        """The report of now, with what is of all sessions; delays begin anew."""
+        """The report of now, with the fields ``of_receiver`` for all sessions; delays begin anew."""
         last_frame_index, objects_detected = self.analyzed
         results = self.take_results(MAX_STILL_RESULTS)
         with self._lock:
@@ -401,7 +401,7 @@ class Reception:
             )
 
     def _miss(self, first: int, end: int, *, at_ns: int) -> None:
-        # Of many, the newest count; what was sent before this ground was there is not missed.
+        # Of many, the newest count; messages sent before this ground was there are not missed.
         if self._still_sequence < 0 and not self._from_start:
             return
         for one in range(max(first, end - MAX_MISSING_STILLS), end):

@@ -1,9 +1,9 @@
 """Tracks that are more likely nothing: weak, never moved, and like nothing around them; which kinds are known.
 
-A post is a pedestrian, a planter a bus: what a detector takes wrongly for an object mostly stands still. Where scores
-are true, a box of .4 is right four times in ten; that it moves over the ground, or that surer ones of its kind and
-size stand around it, as in a row of parked cars, is the better evidence. Without either it is a guess. People
-move, and lane marks stand in rows: who stands must be surer. A kind of vehicle is known where its detections agree.
+A detector takes a post for a pedestrian, a planter for a bus: its false objects mostly stand still. Where scores are
+true, a box of .4 is right four times in ten; better evidence is that it moves over the ground, or that surer ones of
+its kind and size stand around it, as in a row of parked cars. Without either it is a guess. People move, and lane
+marks stand in rows: a standing person must be surer. A kind of vehicle is known where its detections agree.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Guesses:
         return np.array([one in self._ids for one in ids.tolist()], np.bool_)
 
     def doubting(self, still: Refinement) -> Refinement:
-        """What a still says that is not sure, doubted where its track is a guess, or it has none."""
+        """The reading of a still, doubted where it is not sure and its track is a guess, or it has none."""
         if still.unread or are_firm([still.box_base_px], [still.confidence], scale=self._scale)[0]:
             return still
         guess = still.track_id is None or bool(self.among(np.array([still.track_id]))[0])

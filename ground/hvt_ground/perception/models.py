@@ -1,8 +1,8 @@
 """The detector and the classifier of a ground: opened once, for all its sessions.
 
 The detector has a thread, which sessions share: following tracks and listing them never waits for a detection. A
-session has one picture there. While that waits, its next takes its place, so that what is searched is never old.
-Those that wait go in the order of asking: who asks seldom is searched as often as who asks with each picture.
+session has one picture there. While that waits, its next takes its place, so that a searched picture is never old.
+They are searched in the order of asking: a session that asks seldom gets as many turns as one that always asks.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ ModelSet = tuple[FailingDetector, Classifier | None]
 
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
-    """What the files of the models say, read once: later sessions go on though a file is gone, or another."""
+    """Facts from the files of the models, read once: later sessions go on though a file is gone, or another."""
 
     track_confidence: float
     """From where a detection starts a track: as given, else as the detector's file says."""
@@ -130,7 +130,7 @@ class ModelFacts:
 
 
 class NotOpenError(Exception):
-    """The run ends, and its models are not open: nobody looks at what has come."""
+    """The run ends, and its models are not open: nobody looks at the remaining pictures."""
 
 
 class Models:

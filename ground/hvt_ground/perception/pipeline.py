@@ -56,7 +56,7 @@ _MOST_HISTORY_FRAMES = 45
 _MOST_HISTORY_BYTES = 128 * 2**20
 
 _LEAST_INSIDE = 0.5
-"""Tracks are carried on for a while. A box of which more than half has left the picture is of what nobody can see."""
+"""Tracks are carried on for a while. A box of which more than half has left the picture shows nothing any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class PipelineParts:
     search: ScaleSearch | None = None
     """Of the detector, in this session's video; None where its scale is given."""
     turns: AbstractContextManager[None] = field(default_factory=nullcontext)
-    """Around what is analyzed and read: it may hang."""
+    """Around analysis and the reading of stills, which may hang."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class PerceptionCounts:
     outcomes: Counter[str] = field(default_factory=Counter)
     """The outcome of each object in the others."""
     view_trust: float | None = None
-    """Mean confidence of what the detector shows; None where that tells nothing."""
+    """Mean confidence of the detector's boxes; None where that tells nothing."""
     view_unlike: bool = False
     """It is so low that the detector does not know the view."""
 
@@ -213,8 +213,8 @@ class Pipeline:
     def analyze(self, picture: DecodedFrame, *, hurry: bool, news: threading.Event | None = None) -> None:
         """Take the next frame; with ``hurry`` detection waits for a later one, but not for ever.
 
-        Once ``news`` is set the list goes out without what the detector has not found yet: a later frame, or
-        `take_late`, takes that in as if it had been known at once. Without, as in lockstep, it is waited for.
+        Once ``news`` is set the list goes out without the detector's result: a later frame, or `take_late`, takes it
+        in as if it had been known at once. Without ``news``, as in lockstep, the detector is waited for.
         """
         index = picture.frame_index
         with self._parts.turns:
@@ -228,7 +228,7 @@ class Pipeline:
         self._show(own, picture.capture_ns)
 
     def take_late(self) -> bool:
-        """Take in what the detector has found since the list of its picture went out; True while it is still at it.
+        """Take in objects found after the list of their picture went out; True while the detector still searches.
 
         Stills would else find no tracks at the last pictures before a pause.
         """
@@ -250,7 +250,7 @@ class Pipeline:
             self._show(self._own_at(index), capture_ns, looked_ns=self._picture_ns)
 
     def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
-        """Take what the edge's tracker listed at one frame: ids and class ids the edge's, boxes in base pixels.
+        """Take the list of the edge's tracker at one frame: its own ids and class ids, boxes in base pixels.
 
         A step of a frame that is newer than all that was shown is shown at once: the base stream may leave that frame
         out. ``capture_ns`` is that frame's; None reckons it from the newest picture.
@@ -365,7 +365,7 @@ class Pipeline:
         return found if parts.search is None else parts.search.take(found, image)
 
     def _take_found(self, detection: Detection) -> Tracks:
-        # What was found in the picture that was searched; our tracks there.
+        # Takes the objects of the searched picture; our tracks there.
         parts, self._detection = self._parts, None
         found = detection.found.result()
         self.trust.take(found)
@@ -426,8 +426,8 @@ class Pipeline:
             self._emit(event)
 
     def _doubting(self, shown: Overlay) -> Overlay:
-        # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the
-        # edge's alone sees is its own affair.
+        # In a view that our detector does not know all its tracks are guesses, and no class is certain. Tracks
+        # that only the edge sees are not touched.
         guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
         doubted = shown.doubted
         if guesses is not None:
@@ -452,7 +452,7 @@ class Pipeline:
 
 
 def _gray(picture: Picture) -> Image:
-    # What it takes to follow the camera. Only pictures that are searched are converted to BGR.
+    # Gray is enough to follow the camera. Only searched pictures are converted to BGR.
     return picture.gray() if isinstance(picture, YuvPicture) else picture
 
 

@@ -1,6 +1,6 @@
-"""A session's perception, from the settings: live, and of what was stored.
+"""A session's perception, from the settings: live, and of stored video.
 
-Both trust the view alike. What was stored touches neither the tracks of the open session nor a detector's memory.
+Both trust the view alike. Stored video touches neither the tracks of the open session nor a detector's memory.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Emit = Callable[[Event], None]
 
 
 class SessionPerception:
-    """Of one session: `pipeline` for what is live, `track` and `read` for what was stored, in one thread."""
+    """Of one session: `pipeline` for live messages, `track` and `read` for stored ones, in one thread."""
 
     def __init__(self, config: GroundConfig, models: Models, info: Info) -> None:
         self._config, self._models, self._info = config, models, info
@@ -89,9 +89,9 @@ class SessionPerception:
         )
 
     def track(self, emit: Emit) -> Callable[[int, int, Image], None]:
-        """What detects and tracks along one stretch of video, given frame index, capture time and picture in order.
+        """A function that detects and tracks along one stretch of video, given frame index, capture time and picture.
 
-        What is doubted live is doubted there.
+        Tracks that would be doubted live are doubted there.
         """
         (detector, _), tracker, guesses = self._taken(), self._tracker(), self._guesses()
         every, before = self._detect_every, self._next_id - 1
@@ -179,7 +179,7 @@ class SessionPerception:
         return Guesses(fps=info.fps, scale=info.view.scale) if self._models.facts.calibrated else None
 
     def _scale_search(self, detector: FailingDetector) -> ScaleSearch | None:
-        # What it promises are sums of probabilities. The hint that little is found counts pictures, not their parts.
+        # Its promises are sums of probabilities. The hint that little is found counts pictures, not their parts.
         facts = self._models.facts
         if not facts.calibrated or not searches_scale(self._config.tiles, pace=self._info.pace):
             return None

@@ -1,7 +1,7 @@
 """The thread of perception, beside the receiving one, so that decoding never waits for detection.
 
-In real time what comes too fast is passed over, newest first; in lockstep nothing is, and the order is always the
-same: the same input gives the same tracks.
+In real time pictures that come too fast are passed over, newest first; in lockstep nothing is, and the order is
+always the same: the same input gives the same tracks.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ _JOB_STEP_S = 0.1
 """On a machine that never comes to rest jobs still get one step in so long."""
 _STEP_LAG = 2
 """In lockstep a step, or a pose, counts from so many frames on. It is sent right before the next access unit, which
-may overtake it by microseconds: this is what makes the order the same in every run."""
+may overtake it by microseconds: this makes the order the same in every run."""
 _AHEAD = 2
 
 Analyze = Callable[[DecodedFrame, bool, threading.Event | None], None]
-"""Called with a picture, whether to hurry, and what is set once anything comes (None: all is waited for)."""
+"""Called with a picture, whether to hurry, and an event that is set once anything comes (None: all is waited for)."""
 Step = Callable[[Tracks, int], None]
 """Called with the edge's tracks at one frame, and that frame's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
 
 
 Job = Generator[None, None, None]
-"""Work that can wait, done step by step while nothing newer is there. What a step raises ends this job alone; it is
-closed at its end, done or not."""
+"""Work that can wait, done step by step while nothing newer is there. An exception of a step ends this job alone; it
+is closed at its end, done or not."""
 
 
 class _Worker:
@@ -103,9 +103,9 @@ class _Worker:
 class RealtimeWorker(_Worker):
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still.
 
-    ``pass_over`` takes frame and capture time of a picture for which there is no time, ``take_late()`` what was found
-    since its picture was analyzed: True while more may be. `close` gives it ``finish_s`` for what waits, then
-    ``leave_s`` for what is in hand.
+    ``pass_over`` takes frame and capture time of a picture for which there is no time, ``take_late()`` the objects
+    found since their picture was analyzed: True while more may come. `close` leaves ``finish_s`` for the queues, then
+    ``leave_s`` for the present work.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class RealtimeWorker(_Worker):
 
     @property
     def idle(self) -> bool:
-        # In the order that things go: from what waits into the hand, from there to the detector.
+        # In the order of the work: from the queues to the present work, from there to the detector.
         return not (self._has_news() or self._jobs or self._last_jobs or self._in_hand or self._searching)
 
     @property
@@ -253,7 +253,7 @@ class RealtimeWorker(_Worker):
         while self._steps and not self._given_up.is_set() and not self._picture_before(self._steps[0][0]):
             self._step(*self._steps.popleft())
         if stills:
-            # What came while the detector ran would wait as long again.
+            # Pictures that came while the detector ran would wait as long again.
             self._take_pictures(hurry=True, awaited=True)
             self._read(stills)
         if self._has_news():

@@ -1,4 +1,4 @@
-"""The files of a session's recording: `session_files` writes them and says of each what a `row` has.
+"""The files of a session's recording: `session_files` writes them and tells the facts of each, a `row`.
 
 Extras that read recordings back give others `Recorded`.
 """

@@ -1,6 +1,6 @@
 """The index's row of one file of a recording.
 
-`Recorded` is what a recording holds that was read back, for those that write it in another form.
+`Recorded` holds the content of a recording that was read back, for exports in other forms.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class Recorded(ABC):
     notices: Sequence[Notice]
     poses: Sequence[PoseUpdate]
     locator: Locator
-    """What places its tracks."""
+    """Gives its tracks places on the map."""
 
     @cached_property
     def trail(self) -> PoseTrail:

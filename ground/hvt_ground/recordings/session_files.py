@@ -1,8 +1,8 @@
 """Records one session in files that follow each other, each of which opens by itself, and tells the index of them.
 
 A file ends where a keyframe comes after its time or size is up. Video goes on in the next one at once; the former
-stays open until perception has come to that keyframe too, so that boxes end where video ends. What was stored at the
-edge and is of a former file's time goes into a file beside that one. All have the session's recording id: opened
+stays open until perception has come to that keyframe too, so that boxes end where video ends. Objects stored at
+the edge that are of a former file's time go into a file beside that one. All have the session's recording id: opened
 together they are shown as one.
 """
 
@@ -28,8 +28,8 @@ from hvt_ground.sinks.rerun.recording_file import RecordingFile
 
 _REPORT_S = 10.0
 _SMALL_BYTES, _MOST_SMALL = 128 * 2**10, 8
-"""A file costs 190 kB beside what came. Where less than this has come, the next begins only so often in a session, or
-once half its time has passed here, too: capture times are the edge's word."""
+"""A file costs 190 kB beside its content. With less content the next one begins at most 8 times in a session, or once
+half its time has passed here, too: capture times are the edge's word."""
 _BEHIND_S = 3.0
 """For so long a former file waits for perception."""
 _MOST_LATE_OPEN, _MOST_LATE = 4, 32
@@ -39,8 +39,8 @@ _MOST_LATE_OPEN, _MOST_LATE = 4, 32
 class SessionFiles(SinkWriter[Event]):
     """A sink, as `Recorder`. Without ``split`` all goes into the file of ``settings``.
 
-    Otherwise that gives the names: ``flight.rrd`` becomes ``flight-0001.rrd``, ``flight-0002.rrd`` and, for what
-    comes late, ``flight-0001-backlog.rrd``; none is written over. ``tell`` gets the facts of each file when it begins
+    Otherwise that gives the names: ``flight.rrd`` becomes ``flight-0001.rrd``, ``flight-0002.rrd`` and, for late
+    objects, ``flight-0001-backlog.rrd``; none is written over. ``tell`` gets the facts of each file when it begins
     and ends, and every few seconds.
     """
 
@@ -142,7 +142,7 @@ class SessionFiles(SinkWriter[Event]):
             self._close(former, hurry)
 
     def _placed(self, item: FrameEvent) -> tuple[FrameEvent, RecordingFile]:
-        # The file that an event goes into; what came too late for its own is put at the beginning of the newest.
+        # The file that an event goes into; one too late for its own file is put at the beginning of the newest.
         part = bisect_right(self._starts, item.frame_index, key=lambda start: start[0])
         newest = len(self._starts)
         if part == newest:
@@ -179,7 +179,7 @@ class SessionFiles(SinkWriter[Event]):
         base = self._base
         return _free(base.with_name(f"{base.stem}-{one:04d}{base.suffix}") for one in count(number))
 
-    # What others learn
+    # Facts for others
 
     def _opened(self, file: RecordingFile, *, backlog: bool = False) -> RecordingFile:
         self._accounts[file] = FileAccount(backlog=backlog or self._backlog)

@@ -1,7 +1,7 @@
 """The state of a ground at one moment, as one value.
 
 Made once a second (`StateMaker`). Status line, page, metrics and ``hvt-ground status`` read it and nothing else, so
-that none of them says what another does not. What is not known is None, never 0.
+that all of them say the same. An unknown value is None, never 0.
 """
 
 from __future__ import annotations
@@ -118,14 +118,14 @@ class SessionState:
     """The edge's."""
     method: str = _of(lambda at: at.session.reception.method)
     levers: str = _of(lambda at: at.session.reception.levers)
-    """What ``--profile auto`` sends beside the video and why; empty without."""
+    """The choices of ``--profile auto`` beside the video, with the reasons; empty without."""
     lockstep: bool = _of(lambda at: at.session.lockstep)
     duration_s: float = _of(lambda at: at.session.reception.duration_s)
     source_size: tuple[int, int] = _of(lambda at: at.session.info.source_size)
     base_size: tuple[int, int] = _of(lambda at: at.session.info.base_size)
     fps: float = _of(lambda at: at.session.info.fps)
     budget_bps: int = _of(lambda at: at.session.reception.budget_bps)
-    """As it is now, like the method; what was commanded shows within half a minute."""
+    """As it is now, like the method; a command shows within half a minute."""
     mean_bps: int = _of(
         lambda at: at.session.reception.ledger.mean_bps(
             max(at.session.reception.duration_s, at.session.info.window_ns / SECOND_NS)
@@ -135,7 +135,7 @@ class SessionState:
     total_bps: float | None = _live(lambda _, now: now.total_bps)
     """Over the budget's window, like the two below; None while no picture comes, like all that is of now."""
     budget_share: float | None = _live(lambda one, now: now.total_bps / one.reception.budget_bps)
-    """What that is of the budget."""
+    """The same as a share of the budget."""
     base_bps: float | None = _live(lambda _, now: now.base_bps)
     roi_bps: float | None = _live(lambda _, now: now.roi_bps)
     delay_p50_ms: float | None = _delay_ms(50)
@@ -161,18 +161,18 @@ class SessionState:
     )
     """For their turn or their base frame."""
     still_outcomes: Mapping[str, int] = _of(lambda at: dict(at.session.perceived.outcomes))
-    """What became of the objects in them."""
+    """The outcomes of the objects in them."""
     stills_not_sent: Mapping[str, int] = _of(lambda at: dict(at.session.reception.not_sent))
     """Why candidates have no still: the edge's counts, by reason."""
     tracks: int = _of(lambda at: at.session.perceived.tracks)
     tracks_refined: int = _of(lambda at: at.session.perceived.refined)
     tracks_doubted: int | None = _live(lambda one, _: one.perceived.doubted)
-    """Shown now, and nothing of what is looked for as stills have it; None while no picture comes."""
+    """Shown now, and doubted: by stills, or in a view unknown to the detector; None while no picture comes."""
     view_trust: float | None = _live(lambda one, _: one.perceived.view_trust)
-    """Mean confidence of what the ground's detector shows, 0…1; None for another than the embedded one, before there
-    was enough, and while no picture comes."""
+    """Mean confidence of the ground detector's boxes, 0…1; None for another than the embedded one, before there were
+    enough, and while no picture comes."""
     view_unlike: bool = _of(lambda at: at.traffic is not None and at.session.perceived.view_unlike)
-    """It is so low that the view is unlike what the detector knows: boxes are thin and unnamed."""
+    """It is so low that the detector does not know the view: boxes are thin and unnamed."""
     class_changes: int = _of(lambda at: at.session.perceived.class_changes)
     detections: int = _of(lambda at: at.session.perceived.detections_run)
     backlog_stills: int = _of(lambda at: at.session.backlog.totals.stills)
@@ -183,7 +183,7 @@ class SessionState:
     edge_frames: FrameAccount | None = _counted(  # noqa: RUF009 - likewise
         lambda status: status.frame_account if status.frames else None
     )
-    """What became of each of the edge's source frames; None also where an earlier edge does not say."""
+    """The outcomes of the edge's source frames, counted; None also where an earlier edge does not say."""
     edge_frames_dropped: int | None = _counted(lambda status: status.health.frames_dropped)
     """At the edge before encoding, all; None before its first report, as all below."""
     edge_frames_dropped_cpu: int | None = _counted(lambda status: status.health.frames_dropped_cpu)

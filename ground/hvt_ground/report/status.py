@@ -117,7 +117,7 @@ def completed(
     """The summary of a session, with the counts over all sessions of its edge, and the ground's own failures.
 
     Messages that were skipped, recordings of former sessions, of which a backlog came, parts that failed; and, once
-    they are closed, what became of the session's ``sinks``.
+    they are closed, the results of the session's ``sinks``.
     """
     edge = content["edge"]
     general = () if failures is None else failures.parts

@@ -38,7 +38,7 @@ _INBOX_SHARE = 0.75
 _MOST_PER_S = 2000
 """Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
 _MOST_REPORTS_PER_S = 100
-"""An edge says each second how it is, in lockstep each second of its clip. What costs all sinks a turn is bounded."""
+"""An edge reports its state each second, in lockstep each second of its clip. Each report costs all sinks a turn."""
 _ANSWER_S = 1.0
 _MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
@@ -232,7 +232,7 @@ class ReceiverReports:
         self._lock = threading.Lock()
 
     def send(self, feedback_of: Callable[..., Feedback]) -> None:
-        """Report what ``feedback_of`` makes of the receiver's own fields: the time and what is of all sessions."""
+        """Send the report of ``feedback_of``, which takes the fields of the receiver: time and counts."""
         with self._lock:
             offset_ns, error_ns = self.clock_offset.estimate or (0, -1)
             feedback = feedback_of(

@@ -50,9 +50,9 @@ _BURST, _EVERY_NS = 30, 5 * SECOND_NS
 
 
 class EdgeSessions:
-    """Routes what comes to the session that is open; requests keyframes and lets the session report.
+    """Routes messages to the open session; requests keyframes and lets the session report.
 
-    Whatever goes wrong ends the session that is open, with its recording whole, and nothing else: another begins with
+    Any exception ends the open session, with its recording whole, and nothing else: another session begins with
     the next keyframe, after a pause that grows where it goes wrong again and again. For one thread: that of `start`,
     which no callback of the link waits for, or without it another's.
 
@@ -93,7 +93,7 @@ class EdgeSessions:
         """When the edge said that the open session has ended."""
         self._ended_id: int | None = None
         self._lost_id: int | None = None
-        """Of a session that ended since its edge was gone: it may come back with nothing but what it has stored."""
+        """Of a session that ended as its edge was gone: only its stored objects may still come."""
         self._backlog_ns: int | None = None
         """When the last chunk of it came that nothing has been said of."""
         self._next_clock_ns = 0
@@ -107,7 +107,7 @@ class EdgeSessions:
         self._stopped_ns: int | None = None
 
     def start(self, *, drain_s: float = 1.0) -> Self:
-        """Begin the thread. When it stops, what has already arrived is still taken in, for so long at the most."""
+        """Begin the thread. When it stops, arrived messages are still taken in, for at most ``drain_s``."""
         self._drain_ns = round(drain_s * SECOND_NS)
         name = f"hvt-receive-{self.port.edge}"
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -121,7 +121,7 @@ class EdgeSessions:
             self.port.inbox.close()
 
     def join(self, *, timeout_s: float = 4.0) -> bool:
-        """Finish what has arrived, close the session, join the thread; False where that took too long."""
+        """Finish arrived messages, close the session, join the thread; False where that took too long."""
         self.stop()
         self._thread.join(timeout_s)
         return self.finished
@@ -148,7 +148,7 @@ class EdgeSessions:
         return self.session is None
 
     def work(self, item: Received | None, *, pending: bool) -> None:
-        """Take one message, if there is one, and do what is due; ``pending``: more wait. It never raises."""
+        """Take one message, if there is one, and do all that is due; ``pending``: more wait. It never raises."""
         try:
             self.port.raise_error()
             if item is not None:
@@ -164,7 +164,7 @@ class EdgeSessions:
         self._note_held()
 
     def _note_held(self) -> None:
-        # What is missing is said at once: each moment more is one without a picture.
+        # Missing units are reported at once: each moment more is one without a picture.
         session, missing, newest = self.session, self.receiver.missing(), self.receiver.stream.newest_held
         if session is None:
             return
@@ -181,10 +181,10 @@ class EdgeSessions:
         except Exception as error:  # noqa: BLE001 - the summaries are there all the same
             self.failures.failed(f"recordings of former sessions of {self.port.edge}", reason_of(error))
 
-    # What is due
+    # Housekeeping
 
     def housekeep(self, *, pending: bool) -> None:
-        """Do what is due by now; raises whatever goes wrong with it."""
+        """Do all that is due by now; raises any exception of it."""
         for packet in self.receiver.take_overdue(pending=pending):
             self._route(packet)
         self._note_held()
@@ -350,7 +350,7 @@ class EdgeSessions:
             return
         self._end_session()
         if info is None:
-            if due(time.monotonic_ns()):  # else what it said is of no use
+            if due(time.monotonic_ns()):  # else its answer was of no use
                 self.receiver.skip("info", WireError("the edge does not say what its session is"))
             return
         if not self._beginnings.take(self._clock()):

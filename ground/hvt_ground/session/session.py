@@ -57,7 +57,7 @@ def _perceives(act: Callable[P, None]) -> Callable[P, None]:
 class Session:
     """Fed by the receiving thread in order; a worker analyzes, so that decoding never waits for detection.
 
-    In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input
+    In real time the worker passes over pictures that are too many. In lockstep nothing is skipped, and the same input
     gives the same tracks. ``worker_of`` makes the worker, which makes perception by ``pipeline_of`` before its first
     picture, and may wait for models there. Without ``reports`` nothing is reported, and the edge's clock is this one
     (Unix nanoseconds without steps).
@@ -87,12 +87,12 @@ class Session:
             emit=self._emit,
             note=self.note,
         )
-        """What came."""
+        """The account of its messages."""
         self._make_pipeline = partial(pipeline_of, self._emit)
         self._pipeline: Pipeline | None = None
         self.frames_decoded = 0
         self.failure = ""
-        """What ended it, where that was no regular end."""
+        """The reason of its end, where that was no regular end."""
         self._clock = clock
         self._reports = reports
         self._decoder = BaseDecoder(size=info.base_size)
@@ -116,9 +116,9 @@ class Session:
             stills=self.reception.sequences,
             outputs=[one for one in self._queued if one.for_backlog],
         )
-        """What of this session was stored at the edge while the link was down."""
+        """Objects of this session that the edge stored while the link was down."""
 
-    # What the receiving thread brings
+    # From the receiving thread
 
     def base(self, arrival: Arrival[Received]) -> bool:
         """Take one access unit; False where the decoder could make nothing of it."""
@@ -149,7 +149,7 @@ class Session:
         return True
 
     def take(self, header: RoiHeader | TrackStep | PoseReport | Status, item: Received) -> None:
-        """Take another message than an access unit. Raises `WireError` where what is in it makes no sense."""
+        """Take another message than an access unit. Raises `WireError` where its contents make no sense."""
         match header:
             case RoiHeader():
                 header = header.named(self.info.class_names)
@@ -189,9 +189,9 @@ class Session:
         )
 
     def close(self) -> None:
-        """Finish what is queued (for a second or two) and close the sinks, each whatever the others do.
+        """Finish the queue (for a second or two) and close the sinks, each whatever the others do.
 
-        Raises what went wrong on the way, or ended the worker.
+        Raises an exception of these, or the one that ended the worker.
         """
         with ExitStack() as stack:
             for sink in self.sinks:
@@ -216,7 +216,7 @@ class Session:
         ended = last is not None and last.state == "ended"
         self.note("info", "the flight has ended" if ended else "this session has ended", last=True)
 
-    # What is known of it
+    # Its state
 
     @property
     def pipeline(self) -> Pipeline:
@@ -245,7 +245,7 @@ class Session:
     # Reports
 
     def report_if_due(self) -> None:
-        """Report to the edge, as often as what has arrived is worth it."""
+        """Report to the edge, the more often the more bytes arrive."""
         if self.reception.due(now_ns=self._clock()):
             self.report()
 

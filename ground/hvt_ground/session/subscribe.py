@@ -36,7 +36,7 @@ _SUBSCRIBED = (
 
 
 class _General:
-    """Takes what comes by the subscriptions of all edges, but for those that have their own."""
+    """Takes messages by the subscriptions of all edges, but for edges that have their own."""
 
     def __init__(self, link: GroundLink) -> None:
         self._link = link
@@ -47,7 +47,7 @@ class _General:
 
 
 class GroundLink:
-    """Sorts what comes by edge. `ports` grows as edges appear that ``edges``, the pattern, accepts.
+    """Sorts messages by edge. `ports` grows as edges appear that the pattern ``edges`` accepts.
 
     With a ``group`` only the edges that are this member's are subscribed to, and a port goes when its edge moves.
     ``log`` gets all that comes from an edge, in Zenoh's callbacks. ``still_codecs`` are those that edges are told to

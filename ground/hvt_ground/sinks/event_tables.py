@@ -29,10 +29,10 @@ TRACK_COLUMNS = (
     *("latitude", "longitude", "error_m"),
 )
 """``frame_index`` counts from 0, as on the wire, and ``x y w h`` are base pixels; ``capture_utc`` is the time at the
-camera by the edge's clock; ``base_class`` is what the detectors say without stills, ``class`` the same after
+camera by the edge's clock; ``base_class`` is the detectors' class without stills, ``class`` the same after
 refinement, ``refined`` 1 once a still has refined it; ``origin``: ``base``, ``edge``, ``edge+base`` or ``still``;
 ``late``: 1 where it is of stored video that came after an outage, behind later frames; ``doubted``: 1 where stills
-say that it is nothing of mine, or the view is unlike what the detector knows; ``latitude longitude`` are where it
+say that it is nothing of mine, or the detector does not know the view; ``latitude longitude`` are where it
 stands (WGS 84, degrees) and ``error_m`` half the longer axis of the ellipse that holds it with 95 %, empty where no
 pose tells. A source frame that the base stream left out has lines too where the edge reported it."""
 
@@ -40,7 +40,7 @@ STILL_COLUMNS = (
     *("file", "frame_index", "known_frame_index", "still", "track", "edge_track", "x", "y", "w", "h"),
     *("class_before", "class_after", "confidence", "reason"),
 )
-"""``frame_index`` is what the still shows and ``known_frame_index`` when it was known here, both from 0; ``x y w h``
+"""``frame_index`` is the still's frame, ``known_frame_index`` the one at which it was known, both from 0; ``x y w h``
 is where the whole picture lies in the base picture of ``frame_index``, base pixels."""
 
 _FORMULA = re.compile(r"[=@]|[+-](?!\d+(\.\d+)?$)")
@@ -169,7 +169,7 @@ TIMING_COLUMNS = (
 about no frame. ``kind``: base, roi, tracks, status; backlog-still, backlog-base, backlog-info for a chunk of the
 backlog. ``capture_ns`` and ``send_ns`` are by the edge's clock, ``received_ns`` and ``shown_ns`` by this one;
 ``shown_ns``: when it was decoded and recorded (base), read by the classifier (roi), or taken in; 0: never, or a chunk
-of the past that did not complete an object, or one of no use. ``line_bytes``: what it cost on the line, headers of
+of the past that did not complete an object, or one of no use. ``line_bytes``: its bytes on the line, headers of
 Zenoh, TCP and IP included. ``clock_offset_ns``: the edge's clock less this one, as known then: the delay of a message
 is ``received_ns - (capture_ns - clock_offset_ns)``."""
 _MOST_UNREAD = 512

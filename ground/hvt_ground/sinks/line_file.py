@@ -1,4 +1,4 @@
-"""A text file that grows by whole lines: what is written is in the file at once, whole or not at all."""
+"""A text file that grows by whole lines: a written line is in the file at once, whole or not at all."""
 
 from __future__ import annotations
 

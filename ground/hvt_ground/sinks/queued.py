@@ -1,6 +1,6 @@
 """A sink behind a bounded queue, in a thread of its own: its failures and delays are felt nowhere else.
 
-`Sink` is what those see that log, `SinkWriter` the contract of who writes in that thread.
+`Sink` is the side that logs, `SinkWriter` the contract of a writer in that thread.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class SinkWriter(ABC, Generic[T]):
     path: Path | None = None
     """The file that was opened last; None without one."""
     awaits_keyframe = False
-    """Without one it can show nothing of what came last, and somebody looks: one is asked for, once."""
+    """It can show nothing of the last events without one, and somebody looks: one is requested, once."""
 
     @abstractmethod
     def log(self, item: T) -> None: ...
@@ -50,7 +50,7 @@ class SinkWriter(ABC, Generic[T]):
         """So many items were left out before the next one."""
 
     def close(self, hurry: threading.Event | None = None) -> None:
-        """Write what is held back; skip slow extras once ``hurry`` is set. A second call does nothing."""
+        """Write the rest; skip slow extras once ``hurry`` is set. A second call does nothing."""
 
 
 _log = logging.getLogger(__name__)
@@ -66,12 +66,12 @@ _AT_ONCE.set()
 
 
 class QueuedSink(Generic[T]):
-    """Writes in a thread of its own what `log` takes, into a sink that ``open_sink`` makes there.
+    """Writes the items of `log` in a thread of its own, into a sink that ``open_sink`` makes there.
 
-    A sink that raises is closed and made anew after pauses that grow up to ``longest_pause_s``; until then what comes
-    is counted as lost. Where the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as
+    A sink that raises is closed and made anew after pauses that grow up to ``longest_pause_s``; until then items
+    are counted as lost. Where the queue is full `log` waits up to ``wait_s`` for room, then the item is counted as
     dropped. ``failures`` learns of it under the name ``part``, and that it hangs unless it is ``unhurried``.
-    ``for_backlog``: what was stored at the edge is to be written there.
+    ``for_backlog``: items stored at the edge are to be written there.
     """
 
     def __init__(
@@ -168,9 +168,9 @@ class QueuedSink(Generic[T]):
             return not (self._queue or self._in_hand)
 
     def is_open(self, *, within_s: float = 0.0) -> bool:
-        """Whether what is logged now will be written, as far as is known; waits so long for the sink to be made.
+        """Whether an item logged now will be written, as far as is known; waits so long for the sink to be made.
 
-        Not where half the queue is full: what can come later leaves the rest to what is live.
+        Not where half the queue is full: stored items can come later and leave the rest to live ones.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._open or self._failing, within_s)
@@ -207,7 +207,7 @@ class QueuedSink(Generic[T]):
     # In its own thread
 
     def _run(self, open_sink: Callable[[], SinkWriter[T]]) -> None:
-        # Not an attribute: the sink of an ended session is kept for its counts, and what it was made of is not.
+        # Not an attribute: the sink of an ended session is kept for its counts, its maker is not.
         while not self._use(open_sink):
             while not self._pause.due(time.monotonic_ns()):
                 with self._changed:

@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = (), records: bool = True) -> None:
     """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`.
 
-    What ``records`` without ``--record`` does so here.
+    A ground that ``records`` without ``--record`` writes here.
     """
     given = (
         *(config.detector, config.classifier, config.labels, config.detector_labels),
@@ -86,7 +86,7 @@ def make_folders(config: GroundConfig) -> None:
 
 
 def set_aside(config: GroundConfig) -> None:
-    """Move what an earlier run wrote into the named files of this one to a folder ``earlier-<time>`` beside them.
+    """Move named files of this run that an earlier one wrote to a folder ``earlier-<time>`` beside them.
 
     A supervisor starts a ground that died again with the same names, and a flight cannot be received twice. Nothing
     is moved from under another ground that still writes its recording there.
@@ -155,7 +155,7 @@ def output_path(
 def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
     """The path for the backlog of a session that is over, beside the recording of the one that is open.
 
-    Never over another file: its edge has forgotten what is in there.
+    Never over another file: its edge has forgotten the contents.
     """
     if target is not None and target.suffix == ".rrd" and not target.is_dir():
         return free_path([target.with_name(f"{target.stem}-{edge}-backlog.rrd")], taken, number=2)
@@ -187,7 +187,7 @@ OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
 """Opens a sink for a session."""
 
 _LIVE_PAUSE_S = 5.0
-"""At most so long somebody who looks waits for what failed."""
+"""The longest pause before a failed live view is tried again."""
 _LOCKSTEP_WAIT_S = 10.0
 
 
@@ -278,7 +278,7 @@ class SessionFactory:
         )
 
     def open_backlog(self, info: Info) -> BacklogRecording:
-        """The recording of a session that is over; not shown live, for the viewer shows what is now."""
+        """The recording of a session that is over; not shown live, for the viewer shows the present."""
         settings = replace(self._recorder_settings(info), clocked=False)
         stamp = time.strftime("%Y%m%d-%H%M%S")
         names = partial(backlog_path, self.config.record, edge=info.edge, stamp=stamp)

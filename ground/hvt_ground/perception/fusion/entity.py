@@ -1,4 +1,4 @@
-"""One object of the world, its sources, and what speaks against it; see `fuse`.
+"""One object of the world, its sources, and the evidence against it; see `fuse`.
 
 `CameraPath` moves boxes from one frame to another, by the camera's motion over the last seconds.
 """
@@ -197,7 +197,7 @@ SURER = 0.1
 
 
 class MissedDetections:
-    """Sets `Entity.is_doubted` at each step of the edge: what it does not report may be evidence against a track.
+    """Sets `Entity.is_doubted` at each step of the edge: a track that it does not report may be false.
 
     ``edge_classes`` are the unified class ids that the edge can name; a still speaks for an object for
     ``still_frames``.
@@ -222,7 +222,7 @@ class MissedDetections:
                 entity.unlisted, entity.is_doubted = 0, False
                 continue
             is_listed = is_near or (entity.edge_id is not None and not entity.missed)
-            # The edge's tracker may need two detections, and has had one at most of what is newer than its last step.
+            # The edge's tracker may need two detections, with one at most of an object newer than its last step.
             is_new = self._stepped < entity.born < step.frame_index
             entity.unlisted = 0 if is_listed or is_new else entity.unlisted + 1
             ours.append((entity, is_listed))

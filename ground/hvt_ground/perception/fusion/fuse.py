@@ -69,8 +69,8 @@ REACH_S = 1.0
 """For how long the motion of an object is extrapolated."""
 HALF_LIFE_S = 0.3
 EDGE_CLASS_WEIGHT = 0.85
-"""At equal size nearly as much as ours: the drone's network is often the smaller one. What is small in the base is
-called a car, and surely so: on drawn scenes at 640x360, a third of the source, 8 of 94 objects were."""
+"""At equal size nearly as much as ours: the drone's network is often the smaller one. A small object in the base is
+surely called a car: on drawn scenes at 640x360, a third of the source, 8 of 94 objects were."""
 FORGET_S = 10.0
 """How long an entity that nothing observes keeps its id for a track that is found again."""
 MAX_ENTITIES = 2048
@@ -160,13 +160,13 @@ class Fusion:
                 entity = self._add(Entity(own_id=own_id, born=int(own.born_frames[row])))
             entity.born = min(entity.born, int(own.born_frames[row]))
             entity.last_frame = max(entity.last_frame, own.frame_index)
-            if own.seen_frames[row] > entity.voted_frame:  # what was searched may be an earlier picture
+            if own.seen_frames[row] > entity.voted_frame:  # the detector may have searched an earlier picture
                 entity.voted_frame = int(own.seen_frames[row])
                 entity.own_vote.update(int(own.class_ids[row]), float(own.confidences[row]))
         self._update(own, own.frame_index)
 
     def take_step(self, step: Tracks, *, own: Tracks | None) -> bool:
-        """Take what the edge's tracker listed at one frame, which may be before or after our newest frame.
+        """Take the list of the edge's tracker at one frame, which may be before or after our newest frame.
 
         ``own`` are our tracks at that frame, as far as they are known. False for a step that is not newer than the
         last one: it is ignored.
@@ -196,7 +196,7 @@ class Fusion:
     def take_found(self, found: Detections, *, known: Tracks) -> None:
         """Take objects that stills of one frame show and that nobody named; class ids unified, boxes base pixels.
 
-        ``known`` is the list at that frame: what overlaps one of it is no new object.
+        ``known`` is the list at that frame: an object that overlaps one of it is not new.
         """
         frame_index = known.frame_index
         boxes = np.concatenate((known.boxes_xyxy_px, found.boxes_xyxy_px))

@@ -197,7 +197,7 @@ def _once_each(
     overlaps = iou(boxes, boxes)
     both = np.array([line.origin == "edge+base" for line in lines])
     edge = np.array([line.entity.edge_id is not None and line.observed is not None for line in lines])
-    # The edge's tracker lists what it takes for two objects; what it does not know of it cannot tell apart.
+    # Two tracks of the edge are two objects to it; tracks that it does not have it cannot tell apart.
     mixed, alike = edge[:, None] != edge[None], classes[:, None] == classes[None]
     order = np.lexsort((np.arange(len(lines)), -confidences, ~both))
     rank = np.empty(len(lines), int)

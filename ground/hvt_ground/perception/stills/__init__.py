@@ -1,5 +1,5 @@
 """A still at the ground: `stage` takes it through `decode`, `classify` and `refine`, which finds its track.
 
-`vocabulary` says what a classifier's words mean for a track, `posterior` when it is sure; `composite` lays them
+`vocabulary` maps a classifier's words to classes of tracks, `posterior` when it is sure; `composite` lays them
 over the base picture.
 """

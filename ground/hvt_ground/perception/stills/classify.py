@@ -108,7 +108,7 @@ class CropReader:
 class Redetection:
     """Pastes the stills into the decoded frame at their places and detects on the composite, once a frame.
 
-    The detector sees the objects sharp and in their surroundings, which is what it was trained on. Where its input
+    The detector sees the objects sharp and in their surroundings, as in its training. Where its input
     is larger than the base, so is the composite, and the stills keep their detail. A class or a box counts from the
     detector's confidence on, an object that nobody has named from ``new_confidence`` on.
     """

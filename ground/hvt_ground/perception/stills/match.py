@@ -1,6 +1,6 @@
 """Which track of the ground a still of the edge belongs to, at the still's own frame.
 
-Evidence is the IoU of the still's box with the track's box at that frame, and what earlier stills have shown:
+Evidence is the IoU of the still's box with the track's box at that frame, and the matches of earlier stills:
 a track that this edge track was matched to before gains 0.10, one that belongs to another edge track loses
 0.25. Evidence of at least the threshold is needed. So two objects that stand close do not exchange their
 stills when the ground misses one of them for a moment, and yet a clear overlap corrects an old posterior.
@@ -40,7 +40,7 @@ Floats = npt.NDArray[np.float64]
 
 
 Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
-"""What became of a still:
+"""The outcome of a still:
 
 matched
     it spoke on the class of ``track_id``.

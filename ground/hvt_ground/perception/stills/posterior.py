@@ -5,15 +5,15 @@ Fusion is naive Bayes in log space over the classes of tracks (`Vocabulary`), wi
     log P(c) = sum over stills of n_i log max(p_i(c), 1e-4)  +  log b(c)  -  log Z
 
 The floor keeps one confident mistake from being a veto for ever. ``n_i`` is how much the still showed that the base
-did not, 0…1 (`StillStage`). ``b`` is what the detector says on the base stream *now*: its confidence for the class
+did not, 0…1 (`StillStage`). ``b`` is the detector's opinion of the base stream *now*: its confidence for the class
 that its track has voted for, nothing at all below 1/C, and the rest over the others: half of it for *nothing of mine*
 where the classifier can say that, for a detector that errs has mostly seen nothing. It counts as one still however
 often it was repeated, because the votes of successive frames are nearly the same measurement. With half a still, and
 all stills alike, class agreement on a car park at 200 kbps was 0.952 in place of 0.983, and 0.785 in place of 0.804
 on small objects.
 
-A class changes only where its probability exceeds that of the class on the base by `MARGIN`. There is no memory of
-what was shown: the order in which stills arrive must not matter.
+A class changes only where its probability exceeds that of the class on the base by `MARGIN`. Shown classes
+are not remembered: the order in which stills arrive must not matter.
 
 Log-probabilities are summed as integers (in units of 2^-20 nat): the sum does not depend on the order in which
 stills arrive, to the last bit, and does not drift.
@@ -73,7 +73,7 @@ class TrackPosterior:
     def update(self, said: Posterior, *, order: tuple[int, int], side_px: float, news: float = 1.0) -> bool:
         """Take a still's vote; True if it is the newest so far by ``order`` (frame index, sequence).
 
-        ``side_px`` is the shorter side of the object in source pixels, ``news`` (0…1) what it counts in the sum.
+        ``side_px`` is the shorter side of the object in source pixels, ``news`` (0…1) its weight in the sum.
         """
         logs = np.log(np.clip(said.probabilities.astype(np.float64), PROBABILITY_FLOOR, 1.0))
         units = np.rint(logs * news * _UNITS_PER_NAT).astype(np.int64)

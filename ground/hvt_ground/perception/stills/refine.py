@@ -2,12 +2,12 @@
 
 A still names a frame and a box of the edge. Which of the ground's own tracks that is, is decided by `match`
 at that very frame (`Tracks` of the frame, from the history), never by position on the screen of now: a lost
-base packet must not refine the wrong object. What cannot be decided yet is held, and given out as unmatched
-when it never will be.
+base packet must not refine the wrong object. A still that cannot be matched yet is held, and given out as
+unmatched when it never can be.
 
-``replace`` is the paper's rule: the newest still's prediction is the class. ``fuse`` multiplies what all
-stills of the track say (see `TrackPosterior`). Either way a track that is *nothing of mine* is doubted. Frames are
-the only clock here.
+``replace`` is the paper's rule: the newest still's prediction is the class. ``fuse`` multiplies the opinions of all
+stills of the track (see `TrackPosterior`). Either way a track that is *nothing of mine* is doubted. Frames are the
+only clock here.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Refiner:
     a track that was detected but not confirmed then. A track's class is remembered for ``forget_s`` after its last
     frame, more than a lost track may take to be found again. ``iou`` is the least overlap of a still's box with a
     track's: half is the usual threshold of benchmarks, and boxes of two similar neighbours rarely reach it both.
-    ``calibrated``: what the reader of stills says are probabilities; else nothing is ever sure.
+    ``calibrated``: the scores of the reader of stills are probabilities; else nothing is ever sure.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Refiner:
         )  # by ground track id, longest unseen first
 
     def offer(self, still: StillSeen, *, now_frame: int) -> list[StillSeen]:
-        """Take a still; returns what had to make room for it (almost always nothing).
+        """Take a still; returns stills that had to make room for it (almost always none).
 
         ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
         """
@@ -99,7 +99,7 @@ class Refiner:
     def settle(
         self, history: History, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
     ) -> list[StillSeen]:
-        """Match what can be matched and give up what never will be, oldest frame first.
+        """Match stills where that is possible and give up those that never will be, oldest frame first.
 
         Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
         track for one of the edge, where the edge has reported it.
@@ -140,7 +140,7 @@ class Refiner:
         return self.preview(tracks, capture_ns=capture_ns, origins=origins)
 
     def preview(self, tracks: Tracks, *, capture_ns: int = 0, origins: tuple[Origin, ...] = ()) -> Overlay:
-        """What would be shown for these tracks; changes nothing, so any frame may be requested."""
+        """The overlay that these tracks would have; changes nothing, so any frame may be requested."""
         names = self._vocabulary.names
         base_classes = tuple(names[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
@@ -305,7 +305,7 @@ class Refiner:
         return self._calibrated and not nothing and self._is_believed(reading)
 
     def _is_believed(self, reading: ClassEstimate) -> bool:
-        # Only from straight above is what stills say of vehicles right: aslant a hydrant was a truck, at .91.
+        # Stills are right about vehicles only from straight above: aslant a hydrant was a truck, at .91.
         steep = self.tilt.aslant is False
         return reading.sure and (
             steep or kind_of(self._vocabulary.names[reading.class_id]) not in VEHICLE_KINDS
@@ -336,8 +336,8 @@ class ViewTilt:
     Seen from straight above they have one size wherever they are; seen aslant those higher up in the picture are
     farther away, and smaller. The median slope over pairs (Theil 1950, Sen 1968) of the logarithm of their size over
     the height in the picture is -.22 to .14 in nine views from above, 1.5 to 5.0 in four aslant; one more between
-    trees had .06 to .49, and two told nothing, their vehicles far away in a narrow band. What kind of vehicle one is,
-    no network here tells well aslant; ``vague_kinds``: the detector's word alone settles none
+    trees had .06 to .49, and two told nothing, their vehicles far away in a narrow band. No network here
+    tells kinds of vehicle well aslant; ``vague_kinds``: the detector's word alone settles none
     (`hvt_ground.perception.guesses`).
     """
 

@@ -215,8 +215,8 @@ class StillStage:
         self._give_out(event, now)
 
     def _give_out(self, event: Refinement, now: Progress) -> None:
-        # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
-        # was stored while the link was down belongs to that time.
+        # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. A
+        # still stored while the link was down belongs to that time.
         if not event.stored:
             event = replace(event, frame_index=now.frame_index, capture_ns=now.capture_ns)
         self.emit(event)
@@ -233,7 +233,7 @@ class StillStage:
             edge_track_id=track_id,
             box_base_px=box,
             still=still.data,
-            media_type=still_codec(header.codec).media_type,  # not what Zenoh said: that is nobody's word
+            media_type=still_codec(header.codec).media_type,  # Zenoh's encoding is not checked by anybody
             base_crop_bgr=crop,
             class_before=header.class_name,
             class_after=header.class_name,

@@ -1,17 +1,16 @@
 """Translates a classifier's names for a track: its classes are those of the detectors.
 
 *Which.* A class of the same name speaks for that class of a track, and for those of its kind that the classifier has
-no name for; another for the classes of its kind; what is no kind, for those of its group (see `class_names`). A
-network of ImageNet tells groups only (vehicle, person, boat, animal): it was never shown a van from above. The
-paper's ``replace`` takes its kinds too. What means no class of a track is a note on the still.
+no name for; another for the classes of its kind; a name that is no kind, for those of its group (see `class_names`).
+A network of ImageNet tells groups only (vehicle, person, boat, animal): it was never shown a van from above. The
+paper's ``replace`` takes its kinds too. A name that means no class of a track is a note on the still.
 
 *How much.* The probability of a class of a track is that of all the classifier's classes that speak for it. Classes
-of a track that nothing speaks for, a stop sign to a classifier of vehicles, have what is left: it was said of none of
-the others. Where the most of the probability means no class, the still has no vote; nor has a network of ImageNet on
-an object that is too small.
+of a track without such a class, a stop sign to a classifier of vehicles, get the rest of the probability. Where most
+of the probability means no class, the still has no vote; nor has a network of ImageNet on an object too small.
 
-*Nothing of mine.* ``other``, ``background`` or ``nothing``, which a classifier was trained to say of what is none of
-its classes, is one class for detectors and classifier. A track that it wins is doubted.
+*Nothing of mine.* ``other``, ``background`` or ``nothing``, which a classifier was trained to answer for an object
+of none of its classes, is one class for detectors and classifier. A track that it wins is doubted.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ class Vocabulary:
         """Translate the reader's answer; ``called`` is the edge's name of the object, ``side_px`` its shorter side.
 
         The vote is over ``names``; its probabilities need not sum to 1, as several classes may mean one thing. Where
-        there is none (None), a note has the reader's name for what means no class: ``waffle iron .31``.
+        there is none (None), a note has the reader's name without a class: ``waffle iron .31``.
         `ValueError` if the answer does not have one probability for each of the reader's classes.
         """
         if said.probabilities.shape != (len(self._reader),):

@@ -1,4 +1,4 @@
-"""The screen a recording opens as, the names of its views, and what is written to them once: styles and colours."""
+"""The screen that a recording opens with, the names of its views, and their static styles and colours."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def screen(
 def comparison(edges: Sequence[str], *, base_size: tuple[int, int], fps: float) -> rrb.Blueprint:
     """The base pictures of several edges beside each other, their links below; then a tab with the page of each.
 
-    What each has recorded lies below its name.
+    The entities of each edge lie below its name.
     """
     columns = [
         rrb.Vertical(

@@ -1,13 +1,13 @@
 """Writes of an overlay only the visible changes.
 
-A recording answers "what was here at frame N" with the latest value of every component, so a value that did not
+A recording answers a question about frame N with the latest value of every component, so a value that did not
 change need not be written again. Tracks are in four layers: those that the base stream shows and whose class rests
 on it alone, those known from reports only, those that a still has spoken on, and those that stills doubt. Brightness
 follows the probability. Words stand only at tracks that a still renamed or doubts, or that somebody chose.
 
 Boxes are held against jitter: a box keeps the place that is on screen until it has moved more than `CENTRE_STEP_PX`
-or grown more than `HALF_SIZE_STEP_PX`, and is then put on the nearest half pixel. Equal numbers in equal places are
-what the LZ4 compression of a chunk removes. A confidence, its brightness and a label's side are held in the same way.
+or grown more than `HALF_SIZE_STEP_PX`, and is then put on the nearest half pixel. The LZ4 compression of a chunk
+removes equal numbers in equal places. A confidence, its brightness and a label's side are held in the same way.
 """
 
 from __future__ import annotations
@@ -174,9 +174,9 @@ class _Hole:
 
 
 class BacklogOverlays:
-    """Boxes in a hole that is filled later: what to write so that they end where the live stream goes on.
+    """Boxes in a hole that is filled later, written so that they end where the live stream goes on.
 
-    A viewer shows the latest value before its time, so boxes in a hole would stand over what follows it. At the
+    A viewer shows the latest value before its time, so boxes in a hole would stand over the video after it. At the
     first overlay after the hole all is therefore written once more. Holes shorter than a second are none: the
     base stream leaves out frames. Of one recording; not safe for threads.
     """

@@ -1,4 +1,4 @@
-"""Of a recording that may be damaged: what the SDK can read, told without reading it in this process.
+"""The part of a damaged recording that the SDK can read, found without reading it in this process.
 
 On some damage the SDK does not raise: it ends its process. So a process forks for each try. To start it takes as
 long as to import Rerun: it stays for the next file, and ends with this process or after some seconds without one.
@@ -45,7 +45,7 @@ def readable(path: Path, out: Path) -> Path | None:
 
 
 class _Tries:
-    """The process that tries what can be read, while files come; one at a time."""
+    """The process that tries to read, while files come; one at a time."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -123,7 +123,7 @@ def _next_recording(path: Path) -> int:
 
 
 def main() -> None:
-    """Answer the names of a file and of its copy, a line each time, with what was found."""
+    """Answer the names of a file and of its copy, a line each time, with the readable spans."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     answers = os.dup(1)
     os.dup2(2, 1)
@@ -133,7 +133,7 @@ def main() -> None:
 
 
 def tried(path: Path, out: Path) -> bytes:
-    """What `readable` finds, in a process that the SDK may end in a fork."""
+    """The result of `readable`, in a process that the SDK may end in a fork."""
     if _reads(path):
         return _WHOLE
     with path.open("rb") as file:
@@ -156,7 +156,7 @@ class _Copy:
         if not self._others or not self._reads([], least=0):
             return False
         todo, found = [self._others], list[_Span]()
-        while todo and self._tries < _TRIES:  # the longest first: what the tries do not reach is least
+        while todo and self._tries < _TRIES:  # the longest first: the tries leave out the least
             chosen = todo.pop(0)
             half = len(chosen) // 2
             if self._reads(chosen):

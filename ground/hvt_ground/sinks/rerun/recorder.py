@@ -1,7 +1,7 @@
-"""Writes what the ground makes of a stream as one Rerun recording, and shows it live.
+"""Writes the events of a stream as one Rerun recording, and shows them live.
 
 Everything is timed by two timelines, ``frame`` (sequence) and ``capture_time`` (timestamp). See docs/recording.md for
-the entities and for what keeps the file small.
+the entities and for the ways in which the file stays small.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class Recorder(SinkWriter[Event]):
     def log(self, item: Event, *, into: RecordingFile | None = None) -> None:
         """Record an event. An access unit that no decoder could use at its place is left out.
 
-        What was ``stored`` may lie before what was logged already: whoever logs it vouches for its place. It may go
+        An event that was ``stored`` may lie before logged ones: its caller vouches for its place. It may go
         ``into`` another file (`open_file`).
         """
         self._into = file = into or self.file
@@ -195,20 +195,20 @@ class Recorder(SinkWriter[Event]):
         self.path = file.path
         cost = self._size_limit.logged_bytes
         contexts = [one for layer in LAYERS for one in self._new_classes(layer)]
-        # What is of a later time is in there already.
+        # Rows of a later time are in there already.
         shown = [replace(row, at=at) for row in self._shown.values() if row.at is not None and row.at < at]
         file.write([*contexts, *shown])
         self._size_limit.logged_bytes = cost  # the price of another file is not the stills'
 
     def close_file(self, file: RecordingFile, hurry: threading.Event | None = None) -> None:
-        """Compact what is left of a file and close it; a second call does nothing.
+        """Compact the rest of a file and close it; a second call does nothing.
 
         Once ``hurry`` is set no footer is added, which may take seconds.
         """
         if file.closed:
             return
         came = None
-        if file.samples:  # what came may be less than the edge had in mind
+        if file.samples:  # fewer frames may have come than the edge planned
             settings = self._settings
             rate = file.samples / (file.last_sample - file.first_sample + 1) * settings.fps
             frames = f"{rate:.3g} of {settings.fps:g} fps came"
@@ -233,7 +233,7 @@ class Recorder(SinkWriter[Event]):
         # Stored stills lie before others, and may be shown all the same.
         if row.columns in _MOMENTARY or row.at is None:
             return
-        if row.columns == "place":  # moves what is there
+        if row.columns == "place":  # moves the patch there
             patch = self._shown.get((row.path, "patch"))
             if patch is not None and patch.value is not None:
                 moved = replace(patch.value, place=row.value)
@@ -243,7 +243,7 @@ class Recorder(SinkWriter[Event]):
         if before is None or before.at is None or before.at <= row.at:
             self._shown[row.path, row.columns] = row
 
-    # What each event writes
+    # The rows of each event
 
     def _gap_rows(self, event: FrameEvent) -> list[TableRow]:
         if not self._skipped or is_stored(event):

@@ -62,7 +62,7 @@ class RecordingFile:
         except UserError:
             if self.path is None:
                 raise
-            self._compact()  # the same in fewer bytes, these rows included, may be what the disk has room for
+            self._compact()  # the disk may have room for the same in fewer bytes, these rows included
         if self._pending_bytes >= self._compact_bytes:
             self._compact()
 
@@ -88,7 +88,7 @@ class RecordingFile:
         return [self._contexts[layer], self._contexts["legend"]]
 
     def close(self, hurry: threading.Event | None = None, *, session: Chunk | None = None) -> None:
-        """Write the session panel anew, compact what is left and close; a second call does nothing.
+        """Write the session panel anew, compact the rest and close; a second call does nothing.
 
         Once ``hurry`` is set no footer is added, which may take seconds.
         """

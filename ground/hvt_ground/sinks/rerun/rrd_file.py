@@ -2,7 +2,7 @@
 
 Rerun stores chunks: a table of rows of one entity. A chunk costs about 1.3 kB before its first value and a quarter
 of a kB for each further column, as much as half an access unit at 300 kbps; so rows must be gathered. A recording
-that gathers in memory loses what it gathered when the process is killed. `RrdFile` does both: each row is
+that gathers rows in memory loses them when the process is killed. `RrdFile` does both: each row is
 appended at once as a chunk of its own (the *append log*, at the end of the file), and when the append log's rows have
 become ``compact_bytes``, the same rows are written again as one chunk a table, over the append log (*compaction*).
 
@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 STREAM_MAGIC = b"RRF2"
 STREAM_HEADER_BYTES = 12  # with version, compression and serialisation
-_MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
+_MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of the rest
 _END, _CHUNK, _LAST_KIND = 0, 2, 3
 _CHUNK_KIND = _CHUNK.to_bytes(8, "little")
 _BLOCK_BYTES = 2**16
@@ -53,9 +53,9 @@ _filters = threading.Lock()
 class RrdFile:
     """A recording on disk; each call has written its bytes when it returns.
 
-    It opens with ``screen`` and what holds for all of it. Until it is closed its file is locked (flock), which tells
+    It opens with ``screen`` and the static chunks. Until it is closed its file is locked (flock), which tells
     others that it is written to, in whichever process, and ends with the process. Raises `UserError` where the file
-    cannot be created, or (later) written any further: what was written before is whole then.
+    cannot be created, or (later) written any further: earlier writes are whole then.
     """
 
     def __init__(

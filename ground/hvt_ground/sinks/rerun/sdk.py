@@ -1,4 +1,4 @@
-"""Frees what the Rerun SDK keeps, and lets it do one thing at a time.
+"""Frees memory and threads that the Rerun SDK keeps, and lets it do one thing at a time.
 
 Each recording would leave four threads and two megabytes behind, and 15 kB of paths, which the SDK never forgets. A
 ground opens a recording for each session and each return after a long outage, so this has to be flat over weeks. And
@@ -78,7 +78,7 @@ def new_recording(one: RecordingId) -> rr.RecordingStream:
 
 @contextmanager
 def _switched_on() -> Iterator[None]:
-    # ``RERUN=off`` is the SDK's switch for other programs: what begins with it stays empty.
+    # ``RERUN=off`` is the SDK's switch for other programs: a recording that begins with it stays empty.
     switch = os.environ.pop("RERUN", None)
     try:
         yield
@@ -125,7 +125,7 @@ def releasing_recordings() -> Iterator[None]:
     with _list_of_recordings:
         yield
         # It flushes all recordings first, and raises where the viewer of any is gone: that is not this one's fault.
-        # What is not freed then is with the next.
+        # The next release frees the rest.
         with suppress(RuntimeError):
             bindings.flush_and_cleanup_orphaned_recordings()
 

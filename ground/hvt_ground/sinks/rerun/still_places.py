@@ -1,7 +1,7 @@
 """Where stills lie in a recording: slots of the gallery, patches on the enhanced picture. Nothing here knows Rerun.
 
 The gallery is a grid of pairs, base crop left, still right, each held for a while; its coordinates are those of its
-own canvas, `CANVAS` units wide and high. A recording is read by time: what is in a slot may come in any order.
+own canvas, `CANVAS` units wide and high. A recording is read by time: the stills of a slot may come in any order.
 
 A patch rides on its track from the moment it is known. A still is of a frame that has passed when it arrives. It is
 put where its object is now: its place at its own frame, moved as the track has moved since. It stays while its object

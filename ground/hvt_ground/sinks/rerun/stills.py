@@ -35,8 +35,8 @@ PAIR_RATIO = 1.3
 """A pair that costs more than came over the link (a residual still, shown as JPEG) is shown below this ratio …"""
 
 PAIR_SHARE = 0.25
-"""… and, however much video and boxes take, while such pairs are less than this times the bytes received: stills are
-what one looks for."""
+"""… and, however much video and boxes take, while such pairs are less than this times the bytes received: stills
+matter most."""
 
 PATCH_RATIO = 1.25
 """A patch that repeats a picture of the gallery, or follows its track, is written below this ratio."""
@@ -190,10 +190,10 @@ def still_of_event(text: str) -> int | None:
 def still_picture(refinement: Refinement) -> Coded | None:
     """The still as received where it is a JPEG, else the same pixels as JPEG; None if undecodable.
 
-    The viewer shows neither WebP nor AVIF nor what only the ground can decode, and one media type for all pictures
+    The viewer shows neither WebP nor AVIF nor codecs of the ground alone, and one media type for all pictures
     need not be written with each.
     """
-    pixels = refinement.still_bgr  # what the codec made of it: the bytes themselves are a stranger's
+    pixels = refinement.still_bgr  # the decoded pixels: the bytes themselves are a stranger's
     if pixels is None:
         pixels = _decoded(refinement.still)
     if pixels is None or pixels.size == 0:

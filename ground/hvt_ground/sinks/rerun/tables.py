@@ -100,7 +100,7 @@ class Table:
     def add(self, frame: int, capture_ns: int, value: Any) -> Chunk:
         """Gather a row; returns it as a chunk of its own, for the append log.
 
-        Times come from the wire and are reckoned on from there: what no timestamp can hold is held at its end.
+        Times come from the wire: one beyond the range of timestamps becomes the nearest that can be held.
         """
         row = frame, min(max(capture_ns, 0), _LATEST_NS), value
         self._rows.append(row)
@@ -174,7 +174,7 @@ def _labels(**values: Sequence[Sequence[Any]]) -> Columns:
 
 
 def _places(rows: Sequence[Placement]) -> rr.ComponentColumnList:
-    # The viewer reads a transform as a whole: what a row leaves out is not taken from the row before.
+    # The viewer reads a transform as a whole: a missing field is not taken from the row before.
     return rr.Transform3D.columns(
         translation=[(place.x, place.y, 0.0) for place in rows],
         scale=[(place.scale, place.scale, 1.0) for place in rows],
