@@ -1,4 +1,4 @@
-"""Reports of grounds: which of them steers, and the order and pace in which the edge processes them."""
+"""Reports of grounds: which of them steers, and in which order and at which pace the edge processes them."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from hvt_edge.perception.shadow import Detected
 
 _OTHER_RECEIVER_NS = 1_000_000_000
 _MISSED = 3
-"""Base messages: one or two may be lost, or reported a moment later than by another."""
+"""Base messages: one or two may be lost, or reported a moment later than by another ground."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A ground's report with the decisions on it. Pacer, outbox, store and inbox all get the same."""
+    """A ground's report with the edge's decisions on it. Pacer, outbox, store and inbox all get the same one."""
 
     feedback: Feedback
     now_ns: int
-    """When it came, this side's clock."""
+    """When it came, by the edge's clock."""
     primary: bool
-    """It is new and of the ground that steers."""
+    """It is new and comes from the ground that steers."""
     first: bool = False
-    """Another ground steers from now on, or this one began anew: measurements of its path no longer hold."""
+    """Another ground steers from now on, or this one began anew: measurements of the old path no longer hold."""
 
 
 class PrimaryReceiver:
-    """Which ground steers: whose reports count where several may report. Thread-safe; time is an argument.
+    """Chooses the ground that steers: its reports count where several may report. Thread-safe; time is an argument.
 
-    Several grounds see the same thin link, and what one of them has says nothing of the others. So one is the primary
-    receiver: the first that reports, until it is silent for a second, or names nothing new for as long although
+    Several grounds share the same thin link, and the messages of one say nothing of the others. So one is the primary
+    receiver: the first that reports, until it is silent for a second, or names nothing new for a second although
     another has had several messages since. At one frame a second there is nothing new for a second, and whichever of
-    two healthy grounds reports first would be the only one that has the newest. Numbers of reports cost a forger
+    two healthy grounds reports first would be the only one that has the newest. Report numbers cost a forger
     nothing, so one that is too high silences a receiver for that second and no longer.
     """
 
@@ -51,8 +51,8 @@ class PrimaryReceiver:
     def judge(self, feedback: Feedback, *, sent: tuple[int, int], now_ns: int) -> Report:
         """Decide on a report; ``sent`` are the last sequences of base and stills that went out.
 
-        One that names a base message that was never sent does not count. A still that was never sent is a forger's
-        at the ground: the report counts, and says nothing of stills.
+        A report that names a base message never sent does not count. A still never sent comes from a forger that
+        sends to the ground: the report counts, without its stills.
         """
         with self._lock:
             if feedback.base_sequence > sent[0]:
@@ -78,25 +78,25 @@ class PrimaryReceiver:
             return Report(feedback, now_ns, primary=True, first=first)
 
     def forget(self) -> None:
-        """Nobody can be reached: the next report counts, whose ever it is."""
+        """No ground can be reached: the next report counts, whichever ground sends it."""
         with self._lock:
             self._receiver_id, self._sequence = None, -1
 
     def _begins(self, feedback: Feedback, sent: tuple[int, int], now_ns: int) -> bool | None:
-        # Whether the receiver begins (anew) with this report; None where it does not count.
+        # Whether the receiver begins (anew) with this report; None where the report does not count.
         if self._receiver_id is None:
             return True
         quiet_ns = now_ns - self._reported_ns
         if feedback.receiver_id != self._receiver_id:
-            # One that reports and never names anything new must not keep the edge from all the others; as long as it
-            # has named nothing at all, everything that was sent counts.
+            # A ground that reports but never names anything new must not keep the edge from all the others; as long
+            # as it has named nothing at all, everything that was sent counts as new.
             there = sent[0] if self._named == (-1, -1) else feedback.base_sequence
             if there - self._named[0] >= _MISSED:
                 quiet_ns = max(quiet_ns, now_ns - self._progress_ns)
             return True if quiet_ns >= _OTHER_RECEIVER_NS else None
         if feedback.sequence > self._sequence:
             return False
-        # Old, or a number was forged that the receiver itself will not reach for years.
+        # The report is old, or one was forged with a number that the receiver itself will not reach for years.
         return True if quiet_ns >= _OTHER_RECEIVER_NS else None
 
 
@@ -106,28 +106,28 @@ _MAX_RESULTS = 1024
 class FeedbackInbox:
     """Filled from Zenoh's callback, emptied by the frame loop.
 
-    In real time results are taken as they come. In lockstep the loop waits until the ground has done with frame
-    ``n - k`` and all stills of it, and takes exactly those: when a result counts follows from the input alone, and
-    the same input gives the same stills.
+    In real time results are taken as they come. In lockstep the loop waits until the ground is done with frame
+    ``n - k`` and all its stills, and takes exactly those: the moment at which a result counts follows from the input
+    alone, and the same input gives the same stills.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._results: deque[StillResult] = deque(maxlen=_MAX_RESULTS)
         self._last_frame_index = -1
-        # In the order in which they came; a ground may answer what was never asked.
+        # In order of arrival; a ground may answer for a still that was never sent.
         self._answered: Newest[int, None] = Newest(2 * _MAX_RESULTS)
         self._known: Newest[tuple[int, int, bool], None] = Newest(2 * _MAX_RESULTS)
         self._done_sequence = -1
         self._detected: Newest[int, Detected] = Newest(_MAX_RESULTS)
-        """Reports by frame, in the order in which they came."""
+        """Reports by frame, in order of arrival."""
         self._base_messages = 0
         self._roi_messages = 0
         self.received_ns: int | None = None
-        """When the last report came, this side's clock."""
+        """When the last report came, by the edge's clock."""
 
     def on_report(self, report: Report) -> None:
-        """Take in one report, whichever ground's (any thread)."""
+        """Process one report of any ground (any thread)."""
         feedback = report.feedback
         with self._changed:
             self.received_ns = report.now_ns
@@ -142,7 +142,7 @@ class FeedbackInbox:
             self._changed.notify_all()
 
     def _note(self, result: StillResult) -> None:
-        # What one ground could not show another may have classified: an opinion does not silence a request.
+        # One ground may be unable to show a still that another has classified: a result does not silence a request.
         sequence = result.still_sequence
         key = (sequence, -1 if result.again else result.track_id, result.again)
         if sequence > self._done_sequence and key not in self._known:
@@ -156,7 +156,7 @@ class FeedbackInbox:
             return results
 
     def take_up_to(self, sequence: int) -> list[StillResult]:
-        """Return and forget the results of stills up to this one, in their order; more for these come too late."""
+        """Return and forget the results of stills up to this one, in their order; later ones for them are ignored."""
         with self._changed:
             self._done_sequence = max(self._done_sequence, sequence)
             for answered in [one for one in self._answered if one <= self._done_sequence]:
@@ -173,9 +173,9 @@ class FeedbackInbox:
             return ready
 
     def take_detected(self, *, up_to: int | None = None) -> Detected | None:
-        """Return what the ground's own detector shows, and forget it; None where there is no news.
+        """Return the newest report of the ground's own detector, and forget it; None where there is none.
 
-        ``up_to`` this frame: what was said of a later one is for another time.
+        ``up_to``: reports of later frames than this stay for a later call.
         """
         with self._changed:
             due = [one for one in self._detected if up_to is None or one <= up_to]
@@ -194,10 +194,10 @@ class FeedbackInbox:
     def wait_for_end(
         self, *, base: int, roi: int, frame_index: int, still_sequence: int, timeout_s: float
     ) -> bool:
-        """Wait until a ground has all there is; False after the time-out.
+        """Wait until a ground has everything; False after the time-out.
 
-        Either it has received so many messages of each, or, where it joined late, it is done with this frame and has
-        answered this still (-1 for none).
+        Either it has received ``base`` and ``roi`` messages, or, where it joined late, it is done with this frame and
+        has answered this still (-1 for none).
         """
 
         def complete() -> bool:

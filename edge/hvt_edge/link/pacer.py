@@ -1,11 +1,11 @@
 """Paces sending: bounds the bytes in flight, so that no queue stands in kernel or router.
 
-A message is expected to be reported when a link of the present rate would have carried it and all before it (the
-*own time*), a round trip and a report later. While one is overdue, or while more than `_MOST_BACKLOG_NS` of own bytes
-wait for such a link, frames are dropped before they are encoded, and stills wait. So after an outage the picture is
-live at once: there is nothing to catch up with.
+A message is expected to be reported when a link of the present rate would have carried it and all before it (its
+*serialization delay*), plus a round trip and one report later. While a message is overdue, or while more than
+`_MOST_BACKLOG_NS` of the edge's own bytes wait for that link, frames are dropped before they are encoded, and stills
+wait. So after an outage live video starts at once, with nothing to catch up on.
 
-What is under way has two accounts: `Flight` has the bytes, for the pace, `BaseInFlight` the units, for an outage.
+Messages in flight have two accounts: `Flight` counts bytes, for the pace, `BaseInFlight` keeps units, for an outage.
 """
 
 from __future__ import annotations
@@ -24,48 +24,48 @@ from hvt_edge.link.rate_control import LeastDelay, Progress, RateController
 _MS = 1_000_000
 _MOST_BACKLOG_NS = 250 * _MS
 _STILL_BACKLOG_NS = 50 * _MS
-"""A still goes when what was sent before it has (nearly) left: the next base frame finds the link free."""
+"""A still goes when earlier messages have (nearly) left the edge: the next base frame finds the link free."""
 _SLACK_NS = 75 * _MS
 _LEAST_HELD_NS, _FIRST_HELD_NS, _MOST_HELD_NS = 50 * _MS, 150 * _MS, 500 * _MS
 _NO_NEWS_NS = 250 * _MS
-"""Where the link loses messages and reports name none for so long, a keyframe asks whether those overdue are lost."""
+"""If the link loses messages and reports name none for this long, a keyframe probes whether overdue ones are lost."""
 _PROBES_NS = 1500 * _MS
-"""They go for so long at the most."""
+"""The longest time for which such probes are sent."""
 _GIVEN_UP_NS = SECOND_NS
-"""A message so long overdue is lost, if reports come and name none newer for as long."""
+"""A message overdue for this long is lost, if reports come and name no newer one in the same time."""
 _SILENCE_NS = 2 * SECOND_NS
 _PROBE_NS = SECOND_NS
-"""In silence one frame goes out in so long: a ground that has forgotten the session receives nothing else."""
+"""In silence one frame is sent in this time: a ground that has forgotten the session receives nothing else."""
 _START_NS, _START_HOLD_NS = SECOND_NS // 2, 2 * SECOND_NS
-"""So much goes out from a keyframe on before the first report; then it is waited for, so long. A thin link that is
-overrun at once does not let the ground ask what the session is. Who never reports gets everything after that."""
+"""Before the first report, frames go for half a second from a keyframe on, then none for two seconds: a thin link
+that is overrun at once leaves no room to query info. A ground that never reports gets every frame after that."""
 _FORGET_NS = 15 * SECOND_NS
-"""A receiver so long silent has left, where Zenoh still has the link: its lease is shorter. Who else is there gets
-video at the least rate, since behind a router the link may be gone all the same."""
+"""A receiver silent for this long has left, where Zenoh still has the link: its lease is shorter. Other subscribers
+get video at the least rate, since behind a router the link may be gone all the same."""
 _LATE_NS = 3 * SECOND_NS
-"""Where all that is named came late for so long, the way is longer than it was."""
+"""Where all named messages have come late for this long, the path is longer than it was."""
 _MEMORY_NS = 15 * SECOND_NS
-"""So long, to twice as long, the shortest round trip counts."""
+"""The shortest round trip counts for this long, up to twice as long."""
 _MOST_RECORDS = 1024
 _RESEND_NS = SECOND_NS
-"""An access unit that is older is not sent again: a keyframe has been requested by then."""
+"""An older access unit is not sent again: a keyframe has been requested by then."""
 _AGAIN_NS = 30 * _MS
-"""Beyond one and a half round trips, until what was sent again counts as lost again."""
+"""Beyond one and a half round trips: after both a unit that was sent again counts as lost once more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """One base message on its way."""
+    """One base message in flight."""
 
     sequence: int
     sent_ns: int
     serialization_ns: int
-    """From sending until it has left, on a link of the present rate."""
+    """From its sending until a link of the present rate has carried it."""
     line_bytes: int
     up_to_bytes: int
     """Line bytes of everything sent so far, this message included."""
     messages: int
-    """Messages of base and stills sent so far: reports count the lost of both."""
+    """Messages of base and stills sent so far, this one included: reports count the lost messages of both."""
 
 
 class Flight:
@@ -116,7 +116,7 @@ class Flight:
         self._stills.append((sequence, now_ns, line_bytes))
 
     def sent_other(self, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
-        """A message goes out that no report names."""
+        """Count a message that no report names."""
         self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
 
     def backlog_ns(self, *, now_ns: int, rate_bps: int) -> int:
@@ -125,9 +125,9 @@ class Flight:
         return round(8 * SECOND_NS * self._backlog_bytes / rate_bps)
 
     def acknowledge(self, base_sequence: int, still_sequence: int) -> Sent | None:
-        """Take off what has arrived; return the newest base message of it, None where there is none.
+        """Remove messages that have arrived; return the newest base message among them, None where there is none.
 
-        Messages before it have arrived too or are lost. Numbers that were never sent mean nothing.
+        Earlier messages have arrived too or are lost. Sequence numbers that were never sent are ignored.
         """
         if base_sequence > self._last[0] or still_sequence > self._last[1]:
             return None
@@ -142,11 +142,11 @@ class Flight:
         return newest
 
     def refill(self) -> None:
-        """The link is slower than was thought: all that is not reported still waits."""
+        """The link is slower than assumed: all unreported bytes still wait."""
         self._backlog_bytes = max(self._backlog_bytes, self.size_bytes)
 
     def give_up(self) -> None:
-        """Take messages in flight for lost; a late report may still name them."""
+        """Declare messages in flight lost; a late report may still name them."""
         given_up = (*self._given_up, *self._base)
         self.clear()
         self._given_up.extend(given_up)
@@ -164,14 +164,14 @@ class Flight:
         self._total_bytes += line_bytes
 
     def _drain(self, now_ns: int, rate_bps: int) -> None:
-        # Two threads send, with times that may differ a little: never back.
+        # Two threads send, with times that may differ a little: time never goes back.
         elapsed_ns = max(0, now_ns - self._drained_ns)
         self._drained_ns = max(self._drained_ns, now_ns)
         self._backlog_bytes = max(0.0, self._backlog_bytes - rate_bps * elapsed_ns / 8 / SECOND_NS)
 
 
 class BaseInFlight:
-    """Access units that were sent and that no report has named, or that one misses; the oldest leaves first.
+    """Access units that were sent and not acknowledged: unreported ones and missing ones; the oldest leaves first.
 
     Thread-safe.
     """
@@ -183,7 +183,7 @@ class BaseInFlight:
         self._units: dict[int, tuple[int, AccessUnit]] = {}
         """Sequence → time of sending and unit, in order."""
         self._resent: dict[int, int] = {}
-        """Sequence → when it went out again last."""
+        """Sequence → when it was last sent again."""
         self.size_bytes = 0
 
     def __len__(self) -> int:
@@ -200,7 +200,7 @@ class BaseInFlight:
                 self._forget(oldest)
 
     def on_report(self, base_sequence: int, missing: Collection[int] = ()) -> bool:
-        """The primary receiver has come as far as this, without what is ``missing``; whether that is news."""
+        """Forget units up to this sequence but ``missing``, by the primary receiver's report; whether any were."""
         with self._lock:
             come = [one for one in self._units if one <= base_sequence and one not in missing]
             for one in come:
@@ -210,7 +210,7 @@ class BaseInFlight:
     def missing(self, sequence: int, *, now_ns: int, round_trip_ns: int) -> AccessUnit | None:
         """A unit that is worth sending again; None where it is too old, or a keyframe was sent since.
 
-        Nor is one that went again less than about one and a half ``round_trip_ns`` ago: it may be there by now.
+        None too for a unit sent again less than about one and a half ``round_trip_ns`` ago: it may have arrived.
         """
         with self._lock:
             sent_ns, unit = self._units.get(sequence, (0, None))
@@ -221,13 +221,13 @@ class BaseInFlight:
             return unit if useful and not on_its_way else None
 
     def resent(self, sequence: int, *, now_ns: int) -> None:
-        """It goes out again."""
+        """Note that the unit is sent again."""
         with self._lock:
             if sequence in self._units:
                 self._resent[sequence] = now_ns
 
     def take(self) -> list[AccessUnit]:
-        """Return and forget all that may be lost, in order."""
+        """Return and forget all units that may be lost, in order."""
         with self._lock:
             units = [unit for _, unit in self._units.values()]
             self._units.clear()
@@ -254,52 +254,52 @@ class Pacer:
         self._reported_ns: int | None = None
         """When the primary receiver reported last; None while there is none."""
         self._progress_ns = 0
-        """When it last named a base message that was on its way."""
+        """When it last named a base message in flight."""
         self._held_ns = _FIRST_HELD_NS
         self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
         self.round_trip_ns = SECOND_NS // 2
-        """From sending to hearing of it, at its shortest; half a second until one was measured."""
+        """Shortest time from sending a message to its report; half a second until one was measured."""
         self._return_ns = 0
-        """How long reports are on their way, at the shortest, and the difference of the clocks."""
+        """Shortest travel time of a report, plus the difference of the clocks."""
         self._given_up = -1
-        """The newest base message that was taken for lost."""
+        """The newest base message that was declared lost."""
         self._lossy = False
-        """Whether what is overdue is likely lost: so it was the last time."""
+        """Whether overdue messages are likely lost, as they were the last time."""
         self._lost = 0
         self._probed = -1
-        """The base message that was overdue when another went out all the same."""
+        """The oldest message that was overdue when another was sent all the same."""
         self._doubted: int | None = None
-        """The first of those others, until a report tells whether what was overdue is lost."""
+        """The first message sent as a probe, until a report tells whether the overdue one is lost."""
         self._doubt_ns = self._open_ns = 0
-        """When it went, and the last report that did not tell."""
+        """When the probe was sent, and the last report that did not tell."""
         self._late_since_ns: int | None = None
-        """Since when all that was named came late; `_late` is the shortest round trip of what was sent since."""
+        """Since when all named messages came late; `_late` is the shortest round trip of messages sent since then."""
         self._late = LeastDelay(_MEMORY_NS)
         self._last_sent_ns = self._last_bytes = 0
         self._linked: bool | None = None
         self._reports = True
         self._started_ns: int | None = None
-        """When the first keyframe went out since somebody is there."""
+        """When the first keyframe was sent since a subscriber is there."""
         self.ignored = 0
-        """Reports that were old, of another receiver or of none that takes video, or named what was never sent."""
+        """Reports ignored as old, of another receiver, of one without video, or naming a message never sent."""
 
     @property
     def rate_bps(self) -> int:
-        """The total that may be sent, line bits a second."""
+        """The total rate that may be sent, line bits a second."""
         return self._controller.rate_bps
 
     @property
     def steady_bps(self) -> int:
-        """The rate that x265 should be opened for a share of."""
+        """The rate of which x265 should be opened for a share."""
         return self._controller.steady_bps
 
     @property
     def measures(self) -> bool:
-        """Whether a round trip was measured, of the present receiver."""
+        """Whether a round trip to the present receiver was measured."""
         return not self._round_trip.empty
 
     def measured_now(self, now_ns: int) -> bool:
-        """Whether that, and the rate, are of now: no report, or no frame that one could name, measures nothing."""
+        """Whether round trip and rate are current: without reports, or frames for them to name, they are not."""
         with self._lock:
             reports = self._reported_ns is not None and now_ns - self._reported_ns <= _SILENCE_NS
             return self.measures and reports and now_ns - self._progress_ns <= _MEMORY_NS
@@ -313,11 +313,11 @@ class Pacer:
         return self._controller.backoffs
 
     def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
-        """Another ``--budget``, while running; ``floor_bps`` is the ``--min-budget`` that goes with it."""
+        """Set another ``--budget`` while running; ``floor_bps`` is the ``--min-budget`` that belongs to it."""
         with self._lock:
             self._controller.set_ceiling(ceiling_bps, floor_bps=floor_bps)
 
-    # What goes out
+    # Sending
 
     def sent_base(self, sequence: int, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
         with self._lock:
@@ -335,16 +335,16 @@ class Pacer:
             self._flight.sent_still(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
     def sent_other(self, line_bytes: int, *, now_ns: int) -> None:
-        """Status, tracks or a still that was sent before go out: no report tells of it."""
+        """Count status, tracks or a still that is sent again: no report names them."""
         with self._lock:
             self._flight.sent_other(line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
-    # What comes back
+    # Reports
 
     def on_report(self, report: Report) -> None:
         feedback, now_ns = report.feedback, report.now_ns
         with self._lock:
-            # Who takes no video says nothing of its link, also where somebody else does who reports nothing.
+            # A ground without video says nothing of its link, also where the only video receiver never reports.
             video = self._linked is not False and (self._reports or feedback.base_sequence >= 0)
             if not (report.primary and video):
                 self.ignored += 1
@@ -357,7 +357,7 @@ class Pacer:
             self._note_losses(feedback, now_ns)
             oldest = self._flight.oldest
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
-            if silent:  # at the least rate the rest would be waited for longer than for what is lost
+            if silent:  # at the least rate the rest would be overdue only long after it is lost
                 self._flight.clear()
             return_ns = now_ns - feedback.send_ns
             if sent is None or (
@@ -366,7 +366,7 @@ class Pacer:
                 return
             held_ns = 1000 * feedback.base_held_us
             self._note_late(sent, held_ns, now_ns)
-            # The oldest that it names has waited for a report since the one before.
+            # The oldest message that this report names has waited for it since the report before.
             self._note_times(
                 sent, held_ns + max(0, sent.sent_ns - (oldest or sent).sent_ns), return_ns, now_ns
             )
@@ -387,16 +387,16 @@ class Pacer:
                 self._flight.refill()
 
     def on_fault(self, now_ns: int) -> None:
-        """Take a useless report: messages in flight are unknown, and the least is sent."""
+        """Handle an invalid report: the messages in flight are unknown, so the rate falls to the least."""
         with self._lock:
             self._controller.on_silence(now_ns)
             self._flight.clear()
             self._reported_ns = self._progress_ns = now_ns
 
     def link(self, there: bool, *, now_ns: int, reports: bool = True) -> bool:  # noqa: FBT001 - the news itself
-        """Whether anybody can be reached at all. ``reports``: a ground.
+        """Note whether any subscriber can be reached. ``reports``: whether one of them is a ground that reports.
 
-        True where that has just come back, or what was on its way seems lost: who shows the video needs a keyframe.
+        True where the link has just come back, or messages in flight seem lost: the video needs a keyframe to go on.
         """
         with self._lock:
             before, self._linked, self._reports = self._linked, there, reports
@@ -411,7 +411,7 @@ class Pacer:
             lost = reported_ns is not None and (self._give_up(now_ns, reported_ns) or self._probes(now_ns))
             return lost or (before is False and there and self.backoffs > 0)
 
-    # What may go
+    # Admission
 
     def admits_base(self, now_ns: int, *, coding_ns: int = 0) -> bool:
         """Whether a frame may be encoded now, and sent ``coding_ns`` later."""
@@ -423,13 +423,13 @@ class Pacer:
                 return True
             self._give_up(now_ns, self._reported_ns)
             if now_ns - self._reported_ns > _SILENCE_NS:
-                # Stored frames have the former rate: they would stand before live video when the link is back.
+                # Stored frames have the former rate: they would delay live video when the link is back.
                 carries_ns = 8 * SECOND_NS * self._last_bytes // self.rate_bps
                 return now_ns - self._last_sent_ns >= max(_PROBE_NS, carries_ns)
             return self._is_open(now_ns, _MOST_BACKLOG_NS + coding_ns) or self._probes(now_ns)
 
     def holds(self, now_ns: int) -> bool:
-        """Whether it is the link that leaves no room for a frame now, and not the budget's own rate."""
+        """Whether the link, and not the budget's own rate, leaves no room for a frame now."""
         with self._lock:
             if self._reported_ns is None:
                 return not self._may_start(now_ns)
@@ -443,7 +443,7 @@ class Pacer:
             return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
 
     def _give_up(self, now_ns: int, reported_ns: int) -> bool:
-        # Down to the least rate, where no report comes or none names anything; True where that is taken for lost.
+        # Falls to the least rate where no report comes, or none names a message; True where these are declared lost.
         if now_ns - reported_ns > _SILENCE_NS:
             self._controller.on_silence(now_ns)
             return False
@@ -456,7 +456,7 @@ class Pacer:
 
     def _may_start(self, now_ns: int) -> bool:
         if not self._linked or not self._reports or self._started_ns is None:
-            return True  # nothing is known, nothing leaves, or nobody will say what arrives
+            return True  # nothing is known, nothing is sent, or no ground will report arrivals
         return not _START_NS <= now_ns - self._started_ns < _START_NS + _START_HOLD_NS
 
     def _is_open(self, now_ns: int, most_backlog_ns: int) -> bool:
@@ -464,22 +464,22 @@ class Pacer:
         return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= self._slack_ns
 
     def _note_losses(self, feedback: Feedback, now_ns: int) -> None:
-        # What was overdue and came after all was late: in a queue, which further probes would only make longer.
+        # An overdue message that still came was late: it stood in a queue, and further probes would lengthen that.
         lost = feedback.lost_so_far
         if lost != self._lost:
             self._lossy, self._lost = lost > self._lost, lost
             self._doubted = None
         elif self._doubted is None or feedback.base_sequence < self._doubted:
             self._open_ns = now_ns
-        elif now_ns - self._open_ns > _NO_NEWS_NS:  # the receiver has given up by now what it misses
+        elif now_ns - self._open_ns > _NO_NEWS_NS:  # by now the receiver has given up missing messages
             self._lossy = False
             self._doubted = None
 
     def _probes(self, now_ns: int) -> bool:
-        # Whether a keyframe goes although a message is overdue: if all under way was lost no report can say so, since
-        # nothing comes that it could name. The next goes when that one is overdue, too.
+        # Whether a keyframe is sent although a message is overdue: if all in flight were lost no report can say so,
+        # since none arrives for it to name. The next is sent when that keyframe is overdue, too.
         oldest, newest = self._flight.oldest, self._flight.newest
-        # What a queue holds up would have to wait behind all of them.
+        # Messages held up in a queue would have to wait behind all of the probes.
         armed = self._lossy and (self._doubted is None or now_ns - self._doubt_ns < _PROBES_NS)
         if not armed or oldest is None or newest is None or self._overdue_ns(now_ns) <= self._slack_ns:
             return False
@@ -509,7 +509,7 @@ class Pacer:
         self._controller.forget_path()
 
     def _take_longer(self, sent: Sent, return_ns: int, now_ns: int) -> bool:
-        # Whether reports take longer than before, where one names what was given up; else that stood in a queue.
+        # Whether reports take longer than before, if one names a message declared lost; else that stood in a queue.
         longer_ns = 0 if self._return.empty else return_ns - self._return_ns
         if longer_ns <= 0:
             return False
@@ -519,7 +519,7 @@ class Pacer:
         return True
 
     def _note_late(self, sent: Sent, held_ns: int, now_ns: int) -> None:
-        # The rate falls at once, and with it the queue: what is late for longer has a longer way.
+        # The rate falls at once, and the queue with it: messages that stay late longer have a longer path.
         if self._late_ns(sent, now_ns) - held_ns <= _SLACK_NS:
             self._late_since_ns = None
         elif self._late_since_ns is None:
@@ -531,7 +531,7 @@ class Pacer:
                 self.round_trip_ns = least_ns
 
     def _note_times(self, sent: Sent, held_ns: int, return_ns: int, now_ns: int) -> None:
-        # Quickly up, slowly down: what is expected is the longest of the usual.
+        # Rises quickly and falls slowly: the estimate is the longest of the usual times.
         held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
         self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
         self._progress_ns = now_ns

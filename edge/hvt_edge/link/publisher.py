@@ -1,4 +1,4 @@
-"""The edge's end of the link: publishers, then queryables and feedback. Knows Zenoh; knows nothing of frames."""
+"""The edge's end of the link: publishers, queryables and the feedback subscriber. Uses Zenoh; knows no frames."""
 
 from __future__ import annotations
 
@@ -38,27 +38,27 @@ _log = logging.getLogger(__name__)
 
 _PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.POSE, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
-"""Requests, or reports: a ground sends some ten a second."""
+"""Requests, or reports: a ground sends about ten a second."""
 _AGAIN_NS = {Channel.INFO: (2 * SECOND_NS,) * 2}
 _AGAIN_NS |= dict.fromkeys((Channel.CONTROL, Channel.FEEDBACK), (2 * SECOND_NS, 64 * SECOND_NS))
-"""First and longest pause before it is declared anew: a ground asks for info within a fraction of it; some never
-command, some never report."""
+"""First and longest pause before a channel is declared anew. A ground asks for info within a fraction of it; some
+grounds never command, some never report."""
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
-"""Channels that a ground subscribes to in any case; one that only shows the video may leave out the others."""
+"""Channels that every ground subscribes to; one that only shows the video may leave out the others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answers:
-    """The ends that a ground reaches: they run in the link's callbacks, and must be quick."""
+    """The functions that a ground's messages call: they run in the link's callbacks, and must be quick."""
 
     info: Callable[[int], bytes]
-    """The session's facts for a question that came at this time, by the clock of the headers."""
+    """Returns the session's facts for a query that came at this time, by the clock of the headers."""
     control: Callable[[ControlRequest], ControlAnswer]
     on_feedback: Callable[[Feedback], None]
     on_info_request: Callable[[InfoRequest], None] = lambda _request: None
     """Called before ``info`` answers."""
     reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload
-    """Gives the payload back as it leaves (`Transmitter.reply`)."""
+    """Returns the payload as it leaves (`Transmitter.reply`)."""
 
 
 class EdgeLink(Outlet, Protocol):
@@ -71,7 +71,7 @@ class EdgeLink(Outlet, Protocol):
 
     @property
     def trouble(self) -> str:
-        """Why no ground can be reached, where the log has said it."""
+        """The reason why no ground can be reached, where the log has given it."""
         ...
 
     def has_ground(self) -> bool:
@@ -81,14 +81,14 @@ class EdgeLink(Outlet, Protocol):
     def has_subscriber(self, channel: Channel) -> bool: ...
 
     def listen(self, answers: Answers) -> None:
-        """Answer grounds from now on: all that answers them is there."""
+        """Answer grounds from now on; called once all parts that answer exist."""
         ...
 
 
 class ZenohLink:
     """One Zenoh session with publishers of all channels; a context manager.
 
-    Raises `UserError` where a port or an endpoint cannot be used, or another edge of that id is on the link.
+    Raises `UserError` where a port or an endpoint cannot be used, or another edge with that id is on the link.
     """
 
     def __init__(
@@ -127,10 +127,10 @@ class ZenohLink:
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
-        """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
+        """Send one message; blocks while the link is full. A link that is gone drops it without an error."""
         try:
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
-            # A status goes about once a second.
+            # A status is sent about once a second.
             if channel is Channel.STATUS and self._listener is not None and self._loses():
                 self._listener.declare_again(there=self.has_ground())
         except zenoh.ZError as error:
@@ -151,9 +151,9 @@ class ZenohLink:
 
 @dataclass(eq=False)
 class EdgeListener:
-    """Queryables info and control; a subscriber of feedback; last the alive token, by which grounds find the edge.
+    """Declares queryables for info and control, the feedback subscriber, and last the alive token.
 
-    ``clock`` is that of the headers.
+    Grounds find the edge by the token. ``clock`` is the clock of the headers.
     """
 
     session: zenoh.Session
@@ -169,9 +169,9 @@ class EdgeListener:
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
         self._version_said = False
         self._used: set[Channel] = set()
-        """Of who is there now."""
+        """Channels that the present ground has used."""
         self._waits: dict[Channel, RetryPause] = {}
-        """Channels of which nothing is heard while a ground is there."""
+        """Channels on which nothing comes although a ground is there."""
         self._again: Counter[Channel] = Counter()
         self._declared: dict[Channel, zenoh.Queryable[None] | zenoh.Subscriber[None]] = {}
         for channel in (Channel.INFO, Channel.CONTROL, Channel.FEEDBACK):
@@ -183,10 +183,10 @@ class EdgeListener:
         self._token.undeclare()  # type: ignore[no-untyped-call]
 
     def declare_again(self, *, there: bool) -> None:
-        """Declare anew what a ground that is ``there`` does not use; call it about once a second.
+        """Declare anew the channels that a ground, if one is ``there``, does not use; call it about once a second.
 
-        A declaration comes once: where UDP has lost it, the ground could ask nobody and show nothing of this flight,
-        command nothing, or its reports would steer nothing.
+        A declaration is sent once: where UDP has lost it, the ground could not query info and show nothing of this
+        flight, could not command, or its reports would not steer.
         """
         now_ns = self.clock()
         if not there:
@@ -218,7 +218,7 @@ class EdgeListener:
         if query:
             try:
                 self.answers.on_info_request(InfoRequest.parse(query))
-            except WireError as error:  # who asks so is answered all the same
+            except WireError as error:  # a malformed request is answered all the same
                 self._skip("info", error)
         return self._answered(Channel.INFO, lambda: self.answers.info(self.clock()))
 
@@ -233,7 +233,7 @@ class EdgeListener:
         return self._answered(Channel.CONTROL, lambda: self.answers.control(request).pack())
 
     def _answered(self, channel: Channel, answer: Callable[[], bytes]) -> bytes | None:
-        # None where that fails: an error in Zenoh's thread would be nobody's.
+        # None where that fails: no one would handle an error in Zenoh's thread.
         try:
             data = self.answers.reply(channel, answer())
         except Exception as error:  # noqa: BLE001 - see above
@@ -264,7 +264,7 @@ class EdgeListener:
     def _skip(self, channel: str, error: WireError) -> None:
         self.unusable += 1
         if isinstance(error, UnknownVersionError):
-            if not (self._version_said or error.in_common):  # the answer says what this edge speaks
+            if not (self._version_said or error.in_common):  # the answer names the edge's version
                 self._version_said = True
                 _log.warning("%s", error.between("a ground", f"edge {self.keys.edge}"))
             return

@@ -1,16 +1,16 @@
 """The rate that the link carries, from receiver reports: a delay-based controller of the SCReAM and GCC family. Pure.
 
-The signal is queueing delay (RFC 8298, section 4.1.2; RFC 6817): one-way delay above the least seen lately, so the
-two clocks need not agree. From it is taken what the edge's own messages would have waited on a link of exactly the
-present rate (`Progress.serialization_ns`): a keyframe or a burst is no congestion, and what is left, the
+The signal is queueing delay (RFC 8298, section 4.1.2; RFC 6817): one-way delay above the recent minimum, so the
+two clocks need not agree. The controller subtracts the delay that the edge's own messages would have had on a link of
+exactly the present rate (`Progress.serialization_ns`): a keyframe or a burst is no congestion. The rest, the
 **excess**, grows exactly where the link is slower than the rate. It is overuse where it stays high and does not
 fall over several reports (as in CoDel, a burst empties, a standing queue does not). Then the rate becomes a share
-of what arrived meanwhile, which is what the link carries. Messages sent before that say nothing about the new rate
+of the arrival rate meanwhile, which is the link's capacity. Messages sent before that say nothing about the new rate
 and are not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
 
-Growth follows a cubic curve (RFC 9438, section 4.2, in time): quickly back to where it broke down last, long near
-there, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and one that has come
-back is found again in some seconds.
+Growth follows a cubic curve (RFC 9438, section 4.2, in time): quickly back to the rate of the last breakdown, long
+near it, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and a link that has
+come back is used in full again after some seconds.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from hvt_common.units import SECOND_NS
 
 _MS = 1_000_000
 _ABSURD_NS = 60 * SECOND_NS
-"""A delay that differs by so much is a clock that was set, not a queue."""
+"""A delay that changes by this much shows a clock that was set, not a queue."""
 _MTU_BITS = 12_000
 _SOME_LOSS = 0.02
 _GRAVE, _GRAVE_SPAN_NS = 2.5, 150 * _MS
 _LOSS_EVERY_NS = 3 * SECOND_NS
-"""Between two falls for the same loss: a lower rate shows as late."""
+"""Least time between two falls for the same loss: a lower rate takes effect late."""
 _FEW_MESSAGES, _LOSS_MESSAGES = 20, 100
-"""Loss among fewer messages says nothing; that of so many is taken as it is."""
+"""Loss among fewer messages than the first says nothing; from the second on its share is used as measured."""
 _LOSS_DEVIATIONS = 2.0
 _MUCH_LESS, _MUCH_MORE = 0.8, 1.25
-"""By so much the base's rate may be off before x265 is opened anew at once."""
+"""Below or above these ratios of the base's rate x265 is opened anew at once."""
 _SOME_OFF, _SOME_NS = 0.08, 3 * SECOND_NS
-"""And by so much for so long."""
+"""A difference of this share leads to a new opening after this time."""
 _LITTLE_OFF = 0.02
-"""At the ceiling, where the rate will stay."""
+"""The share that replaces it at the ceiling, where the rate will stay."""
 _REST_NS = 1_500 * _MS
-"""Between two openings; a third of it where the rate is by so much (`_FAR_MORE`) higher: it grows in steps."""
+"""Between two openings; a third of it where the rate is higher by `_FAR_MORE`, because it grows in steps."""
 _FAR_MORE = 1.5
 
 
@@ -52,43 +52,43 @@ class RateSettings:
     excess_ns: int = 80 * _MS
     """Overuse begins here; on thin links at two large packets."""
     verdict_ns: int = 300 * _MS
-    """Over so much time, and `verdict_reports`, the excess must stay high."""
+    """The excess must stay high for this time, and over `verdict_reports`."""
     verdict_reports: int = 3
     backoff: float = 0.85
-    """Of the rate that arrived, after overuse."""
+    """Factor on the arrival rate after overuse."""
     plateau_ns: int = 2_600 * _MS
-    """How long it takes back to where it broke down."""
+    """Time of the growth back to the rate of the last breakdown."""
     beyond_per_s3: float = 0.008
-    """Growth beyond, as a share of that rate, by the third power of the seconds."""
+    """Growth beyond it, as a share of that rate, by the third power of the seconds."""
     resume_ns: int = 3 * SECOND_NS
-    """How long it takes back to the former rate after the link was gone."""
+    """Time of the growth back to the former rate after the link was gone."""
     most_loss: float = 0.12
-    """Of messages; less is taken for the link's nature, and only slows growth down."""
+    """Share of lost messages; less counts as the link's nature, and only slows growth down."""
     memory_ns: int = 15 * SECOND_NS
-    """The least delay is that of so long: a route that became longer is no queue for ever."""
+    """Window of the least delay: a route that became longer does not count as a queue for ever."""
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """One report of the newest base message that has arrived, in the edge's own accounts."""
+    """One report of the newest base message that has arrived, in the edge's own counts."""
 
     now_ns: int
-    """When the report came, the edge's clock."""
+    """When the report came, by the edge's clock."""
     sent_ns: int
-    """When the message was sent, the edge's clock."""
+    """When the message was sent, by the edge's clock."""
     arrived_ns: int
-    """The ground's clock."""
+    """When it arrived, by the ground's clock."""
     serialization_ns: int
     """Its delay on a link of the rate of that time, behind the edge's own messages."""
     arrived_bytes: int
-    """Line bytes sent up to and with it: they have all arrived, or are lost."""
+    """Line bytes sent up to this message, itself included: they have all arrived, or are lost."""
     delivery_bps: float = 0.0
-    """Its own line bits over its round trip, without the time for which the ground held the report: a link of less
+    """Its own line bits over its round trip, without the time for which the ground held the report: a slower link
     would have needed longer."""
     messages: int = 0
-    """So many messages of base and stills were sent up to and with it."""
+    """Messages of base and stills sent up to this one, itself included."""
     lost: int = 0
-    """So many of them never came, as the ground counts."""
+    """The lost ones among them, by the ground's count."""
 
 
 class LeastDelay:
@@ -101,7 +101,7 @@ class LeastDelay:
         self._least: int | None = None
 
     def add(self, delay_ns: int, *, now_ns: int) -> int:
-        """Take in one delay; return the least."""
+        """Add one delay; return the least."""
         if self._since_ns is None or now_ns - self._since_ns >= self._memory_ns:
             self._former, self._least, self._since_ns = self._least, None, now_ns
         self._least = delay_ns if self._least is None else min(self._least, delay_ns)
@@ -113,11 +113,11 @@ class LeastDelay:
 
 
 class LossCount:
-    """Whether more than ``most_share`` of the newest messages are lost, at any frame rate.
+    """Tells whether more than ``most_share`` of the newest messages are lost, at any frame rate.
 
-    It counts messages, not seconds: the newest 100, however long these took. Of so many the share is taken as it is.
-    Of 20 to 99, two standard deviations of the binomial distribution more must be lost than a link of just
-    ``most_share`` would lose; of 12 % that are 6 of 20, or 11 of 50. Fewer than 20 say nothing.
+    It counts messages, not seconds: the newest 100, however long these took. For 100 the share is used as measured.
+    For 20 to 99, two standard deviations of the binomial distribution more must be lost than a link of just
+    ``most_share`` would lose; at 12 % that means 6 of 20, or 11 of 50. Fewer than 20 say nothing.
     """
 
     def __init__(self, most_share: float) -> None:
@@ -125,10 +125,10 @@ class LossCount:
         self._counts: deque[tuple[int, int]] = deque()
         """(messages, lost of them) by report."""
         self._marked: tuple[int, int] | None = None
-        """When the rate last fell for it."""
+        """The counts when the rate last fell for loss."""
 
     def add(self, messages: int, lost: int) -> None:
-        """Take in the counts of one report, both since the beginning."""
+        """Add the counts of one report, both since the beginning."""
         self._counts.append((messages, lost))
         while len(self._counts) > 1 and messages - self._counts[1][0] >= _LOSS_MESSAGES:
             self._counts.popleft()
@@ -142,11 +142,11 @@ class LossCount:
         return bool(self._counts) and self._beyond(self._counts[0]) > 0
 
     def lasts(self) -> bool:
-        """Whether too many were lost, as counted, since `mark`."""
+        """Whether the share lost since `mark`, as measured, is too high."""
         return self._marked is None or self._share_since(self._marked) > self._most_share
 
     def mark(self) -> None:
-        """The rate falls for it."""
+        """Note that the rate falls for this loss."""
         self._marked = self._counts[-1]
 
     def clear(self) -> None:
@@ -156,7 +156,7 @@ class LossCount:
 
     @property
     def share(self) -> float:
-        """Of the newest messages, 0…1; 0 where there are too few."""
+        """Share of the newest messages that are lost, 0…1; 0 where there are too few messages."""
         few = not self._counts or self._since(self._counts[0])[0] < _FEW_MESSAGES
         return 0.0 if few else self._share_since(self._counts[0])
 
@@ -187,7 +187,7 @@ class _Judged:
 
 
 class RateController:
-    """Between floor and ceiling. Deterministic, time is an argument; not thread-safe."""
+    """Controls the rate between floor and ceiling. Deterministic, time is an argument; not thread-safe."""
 
     def __init__(self, settings: RateSettings) -> None:
         assert 0 < settings.floor_bps <= settings.ceiling_bps
@@ -197,11 +197,11 @@ class RateController:
         self._base_ns: int | None = None
         self._recent: deque[_Judged] = deque(maxlen=64)
         self._judge_from_ns = -(2**63)
-        """Only messages sent from here on say something about the present rate."""
+        """Only messages sent after this time say something about the present rate."""
         self._cubic_max = self._low = float(settings.ceiling_bps)
         self._plateau_ns = settings.plateau_ns
         self._curve_ns = 2**62
-        """How far along the curve of growth: only time in which nothing speaks against it counts."""
+        """Time along the curve of growth; only time without signs of congestion counts."""
         self._last_ns: int | None = None
         self._silent = False
         self._losses = LossCount(settings.most_loss)
@@ -217,7 +217,7 @@ class RateController:
 
     @property
     def steady_bps(self) -> int:
-        """The rate that is likely to last, for slow followers: near where it broke down, a little below that."""
+        """The rate that is likely to last, for slow followers: near the last breakdown, a little below it."""
         if self._rate >= self._settings.ceiling_bps or self._rate > 1.15 * self._cubic_max:
             return self.rate_bps
         return min(self.rate_bps, max(self._settings.floor_bps, round(0.9 * self._cubic_max)))
@@ -229,11 +229,11 @@ class RateController:
 
     @property
     def excess_ns(self) -> int:
-        """Of the newest report; negative where the link has room."""
+        """Excess delay of the newest report; negative where the link has room."""
         return self._recent[-1].excess_ns if self._recent else 0
 
     def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
-        """Another budget. A rate at the old ceiling goes on at the new one; a lower one grows as before."""
+        """Set another ceiling. A rate at the old ceiling moves to the new one; a lower rate grows as before."""
         old = self._settings
         at_ceiling = self._rate >= old.ceiling_bps
         floor = min(ceiling_bps, old.floor_bps if floor_bps is None else floor_bps)
@@ -242,7 +242,7 @@ class RateController:
             self._rate = self._cubic_max = float(ceiling_bps)
 
     def on_progress(self, progress: Progress) -> int:
-        """Take in one report that names a message that none before has named; return the rate."""
+        """Process one report that names a message for the first time; return the rate."""
         step_ns = self._elapsed(progress.now_ns)
         excess_ns = self._excess(progress)
         if progress.sent_ns < self._judge_from_ns:
@@ -263,7 +263,7 @@ class RateController:
         return self.rate_bps
 
     def on_silence(self, now_ns: int) -> int:
-        """Reports have stopped: down to the floor. When they come again the former rate is approached quickly."""
+        """Reports have stopped: the rate falls to the floor. When they return it nears the former rate quickly."""
         if not self._silent:
             self._silent = True
             if self._curve_ns >= self._plateau_ns:  # else it is still on its way back
@@ -271,19 +271,19 @@ class RateController:
             self._rate = self._low = float(self._settings.floor_bps)
             self._curve_ns, self._plateau_ns = 0, self._settings.resume_ns
             self.backoffs += 1
-            self._losses.clear()  # what a link loses while it is away is no property of it
+            self._losses.clear()  # losses while a link is away are no property of it
             self._start_over(now_ns)
         self._last_ns = now_ns
         return self.rate_bps
 
     def forget_path(self) -> None:
-        """The receiver or the transport is another: delays of before say nothing."""
+        """The receiver or the transport has changed: earlier delays say nothing."""
         self._least = LeastDelay(self._settings.memory_ns)
         self._recent.clear()
         self._losses.clear()
 
     def _elapsed(self, now_ns: int) -> int:
-        # Time since the last report, bounded: one after a long pause is no reason for a leap.
+        # Time since the last report, bounded: a report after a long pause must not make the rate leap.
         step_ns = 0 if self._last_ns is None else min(max(0, now_ns - self._last_ns), 500 * _MS)
         self._last_ns = now_ns
         return step_ns
@@ -306,7 +306,7 @@ class RateController:
             span_ns = chosen[0].progress.arrived_ns - one.progress.arrived_ns
             if len(chosen) >= self._settings.verdict_reports and span_ns >= self._settings.verdict_ns:
                 return chosen[::-1]
-            # Where the link has fallen far, few messages arrive and each is later: two of them suffice.
+            # Where the link has fallen far, few messages arrive and each is later than the last: two of them suffice.
             if len(chosen) == 2 and span_ns >= _GRAVE_SPAN_NS and one.excess_ns > _GRAVE * self._limit_ns():
                 return chosen[::-1]
         return []
@@ -315,7 +315,7 @@ class RateController:
         chosen = self._verdict()
         if not chosen or min(one.excess_ns for one in chosen) <= limit_ns:
             return False
-        return chosen[-1].excess_ns >= chosen[0].excess_ns - limit_ns // 4  # it empties: wait
+        return chosen[-1].excess_ns >= chosen[0].excess_ns - limit_ns // 4  # else the queue empties: wait
 
     def _arriving_bps(self) -> float:
         # The arrival rate while the queue stood: the link's capacity.
@@ -327,7 +327,7 @@ class RateController:
         again = 0.85 * self._cubic_max < broke_bps < 1.15 * self._cubic_max
         self._rate = max(rate, self._rate / 10, self._settings.floor_bps)
         self._cubic_max, self._low, self._curve_ns = max(self._rate, broke_bps), self._rate, 0
-        # A link that breaks down at the same rate time and again is tried more rarely.
+        # At a link that breaks down at the same rate again and again growth is slower.
         least_ns = self._settings.plateau_ns
         self._plateau_ns = min(2 * least_ns, self._plateau_ns * 13 // 10) if again else least_ns
         self.backoffs += 1
@@ -344,8 +344,8 @@ class RateController:
             return
         curve_ns = self._curve_ns + step_ns
         wanted = self._on_curve(curve_ns)
-        # What never arrived proves nothing: where little is sent, the rate does not run away from it. After a silence
-        # little is, however good the link: on the way back to the former rate one message that came quickly suffices.
+        # The rate stays near the measured arrival rate: where little is sent, it does not run away. After a silence
+        # little is sent, however good the link: on the way back one message that came quickly is enough.
         proven = max(2 * self._lately_bps(), min(self._cubic_max, self._delivery_bps()))
         if wanted <= proven:
             self._curve_ns = curve_ns
@@ -359,13 +359,13 @@ class RateController:
         return self._cubic_max * (1 + self._settings.beyond_per_s3 * beyond_s**3)
 
     def _delivery_bps(self) -> float:
-        # The most that one message of about the last second has proved.
+        # The highest rate that one message of about the last second has proved.
         last_ns = self._recent[-1].progress.arrived_ns
         of_late = (one.progress for one in self._recent if last_ns - one.progress.arrived_ns <= SECOND_NS)
         return max(one.delivery_bps for one in of_late)
 
     def _lately_bps(self) -> float:
-        # The arrival rate of about the last second; half the rate if that is not known yet.
+        # The arrival rate of about the last second; half the rate if it is not known yet.
         last = first = self._recent[-1].progress
         for one in reversed(self._recent):
             first = one.progress
@@ -383,9 +383,9 @@ def _arrival_bps(first: Progress, last: Progress) -> float:
 
 
 class ReconfigurationTrigger:
-    """Whether it is worth a keyframe to open x265 at another rate. Time is an argument.
+    """Tells whether it is worth a keyframe to open x265 at another rate. Time is an argument.
 
-    Until then a base stream that is too fast takes from the stills, and then drops frames.
+    Until then a base stream that is too fast takes bits from the stills, and then drops frames.
     """
 
     def __init__(self) -> None:
@@ -393,7 +393,7 @@ class ReconfigurationTrigger:
         self._off_ns: int | None = None
 
     def wants(self, wanted_bps: float, base_bps: float, *, at_ceiling: bool, now_ns: int) -> bool:
-        """``base_bps`` is what x265 is opened for; ``at_ceiling``: the wanted rate is the one that will stay."""
+        """``base_bps`` is the rate of the open x265; ``at_ceiling``: the wanted rate is the one that will stay."""
         ratio = wanted_bps / base_bps
         if abs(ratio - 1) <= (_LITTLE_OFF if at_ceiling else _SOME_OFF):
             self._off_ns = None

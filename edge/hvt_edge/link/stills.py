@@ -1,4 +1,4 @@
-"""A still from its crop to the line, and which codecs the grounds read."""
+"""A still from its crop to the line, and the codecs that the grounds decode."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _PLAIN_ENCODING = "application/octet-stream"
 """The encoding of formats that only HVT reads; one byte on the wire."""
 _OWN_TYPES = "application/vnd.hvt."
 _FORGET_NS = 60_000_000_000
-"""A ground asks for ``info`` three times in it; after that it counts as gone."""
+"""A ground queries ``info`` three times in this time; one that has not counts as gone."""
 _MOST_READERS = 16
 _MOST_SAID = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """The distance of the base from the source at a crop, which bounds that of a still."""
+    """The distance of the base from the source at a crop; a still must come closer."""
 
     places: tuple[Place, ...]
     """The boxes in the crop, without their padding."""
@@ -56,7 +56,7 @@ class Alternative:
     def of(
         cls, base_crop: Image, *, crop: Image, places: tuple[Place, ...], min_gain_db: float
     ) -> Alternative:
-        """``min_gain_db`` is by how much a still must be closer than the base."""
+        """Measure the base crop; ``min_gain_db`` is by how much a still must be closer to the source."""
         share = 10 ** (-min_gain_db / 10)
         limits = tuple(share * error for error in _errors(base_crop, crop, places))
         _, spread = cv2.meanStdDev(cv2.transform(crop.astype(np.float32), _BT601))
@@ -85,16 +85,16 @@ class Alternative:
 class Still:
     """A still: its crop until it is coded, its bytes from then on.
 
-    A pending one holds no whole frames: a 4K frame takes 25 MB, its crops a few kilobytes each.
+    A pending still holds no whole frames: a 4K frame takes 25 MB, its crops a few kilobytes each.
     """
 
     header: RoiHeader
-    """As it goes out, but for session, delay and flags; sequence and quality once it is coded."""
+    """The header as sent, except session, delay and flags; sequence and quality are set once it is coded."""
     media_type: str
     crop_bgr: Image = field(default_factory=lambda: _NO_PIXELS, repr=False, compare=False)
-    """The crop of the source, at the size at which it is coded; empty once it is."""
+    """The crop of the source, at the size at which it is coded; empty afterwards."""
     base_crop_bgr: Image | None = field(default=None, repr=False, compare=False)
-    """The same place in the decoded base frame of the same source frame, at that size; None without one."""
+    """The same region in the decoded base frame of the same source frame, at that size; None without one."""
     alternative: Alternative | None = field(default=None, repr=False, compare=False)
     """None where the base was not at hand."""
     data: bytes = b""
@@ -110,7 +110,7 @@ class Still:
         also: tuple[AlsoShown, ...] = (),
         **facts: Any,
     ) -> Still:
-        """Crop it to ``size`` (width, height), never larger than the crop; ``facts`` are those of the header."""
+        """Crop the source to ``size`` (width, height), never enlarged; ``facts`` are further fields of the header."""
         x1, y1, x2, y2 = crop_px
         crop = source_bgr[y1:y2, x1:x2]
         shrinks = size != (x2 - x1, y2 - y1)
@@ -129,7 +129,7 @@ class Still:
         return cls(header, codec.media_type, np.asarray(pixels, np.uint8))
 
     def beside(self, base: Picture, *, view: View, min_gain_db: float, used: bool = False) -> Still:
-        """The same with what the base of its frame shows there; ``used``: the still builds on that."""
+        """The same still beside the base's crop of that place; ``used``: its codec builds on that crop."""
         height, width = self.crop_bgr.shape[:2]
         size, header = (width, height), self.header
         shown = base_crop(base, view=view, crop_source_px=header.crop_source_px, size=size)
@@ -149,9 +149,9 @@ class Still:
 
     @property
     def encoding(self) -> str:
-        """What Zenoh is told of the payload: its media type, if any program beside HVT could read it.
+        """The encoding declared to Zenoh: the media type, if any program beside HVT could read the payload.
 
-        Spelling a type of our own out would cost up to 34 bytes a still, and the header names the codec anyway.
+        A media type of our own would cost up to 34 bytes a still, and the header names the codec anyway.
         """
         return _PLAIN_ENCODING if self.media_type.startswith(_OWN_TYPES) else self.media_type
 
@@ -166,7 +166,7 @@ class Still:
         return replace(self.of_codec(codec), base_crop_bgr=None)
 
     def coded(self, data: bytes, *, quality_pct: int, parameters: Mapping[str, int | float | str]) -> Still:
-        """As it goes out; ``parameters`` beside those it has."""
+        """The still as sent; ``parameters`` are added to those of the header."""
         header = replace(
             self.header, quality_pct=quality_pct, parameters={**self.header.parameters, **parameters}
         )
@@ -174,7 +174,7 @@ class Still:
 
 
 def size_parameters(crop_px: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:
-    """The coded size for the header; nothing if it is the size of the crop."""
+    """The coded size for the header; empty if it is the size of the crop."""
     if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1]):
         return {}
     return {"w": size[0], "h": size[1]}
@@ -201,7 +201,7 @@ def _errors(image: Image, crop: Image, places: tuple[Place, ...]) -> tuple[float
 
 
 class StillReaders:
-    """The still codecs that each ground reads, by its `InfoRequest`; a ground that named none reads all. Thread-safe.
+    """The still codecs that each ground decodes, by its `InfoRequest`; one that named none decodes all. Thread-safe.
 
     ``clock`` is Unix nanoseconds without steps.
     """
@@ -210,7 +210,7 @@ class StillReaders:
         self._clock = clock
         self._lock = threading.Lock()
         self._readers: Newest[int, tuple[frozenset[str], int]] = Newest(_MOST_READERS)
-        """Codecs by requester, and when it asked last; a stranger's numbers cost a place each."""
+        """Codecs by requester, and the time of its last request; a forged requester number takes one place."""
         self._said: set[str] = set()
         self._video_said = False
 
@@ -226,7 +226,7 @@ class StillReaders:
             self._readers.put(request.requester_id, (frozenset(request.still_codecs), self._clock()))
 
     def read(self, codec: str) -> bool:
-        """Whether every ground that said what it reads, within the last minute, reads this codec."""
+        """Whether every ground that named its codecs within the last minute decodes this one."""
         since_ns = self._clock() - _FORGET_NS
         with self._lock:
             good = all(

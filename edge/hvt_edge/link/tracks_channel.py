@@ -1,4 +1,4 @@
-"""The tracks channel at the edge: which steps are told to the ground, and which tracks of them."""
+"""The tracks channel at the edge: which steps are sent to the ground, and which of their tracks."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
 _EARLY: Final = 0.95
-"""Steps come a little early or late: one that is due nearly is due."""
+"""Steps come a little early or late: one that is due nearly counts as due."""
 
 
 @dataclass(eq=False)
 class TrackReporter:
-    """Tells the ground of the tracks at decision steps."""
+    """Sends tracks to the ground at decision steps."""
 
     sender: Transmitter
     _: KW_ONLY
     session_id: int
     most_per_s: float = 3.0
-    """Steps a second of capture time at most."""
+    """Most steps a second of capture time."""
     most_bps: int = 12_000
-    """Payload bits a second at most: in a crowd steps come less often."""
+    """Most payload bits a second: in a crowd steps come less often."""
     fresh_frames: int = 5
-    """A track whose last detection is older than so many source frames is left out."""
+    """A track whose last detection is more source frames old than this is left out."""
     refresh_ns: int = SECOND_NS
-    """Capture time after which a step stands by itself: a lost one hurts no longer."""
+    """Capture time after which a step is coded without reference to earlier ones: a lost step matters no longer."""
 
     def __post_init__(self) -> None:
         self._encoder = TrackStepEncoder(session_id=self.session_id, refresh_ns=self.refresh_ns)
@@ -41,7 +41,7 @@ class TrackReporter:
     def report(self, seen: AnalyzedFrame, *, now_ns: int) -> bool:
         """Send this step's tracks if it is a decision step and one is due; tell whether it was sent.
 
-        A step without tracks is sent too: that nothing is there is news. ``now_ns`` is the time windows go by.
+        A step without tracks is sent too: an empty scene is news. ``now_ns`` is the time of the budget's windows.
         """
         capture_ns = seen.frame.capture_ns
         if not seen.detected or not self._due(capture_ns):

@@ -2,18 +2,18 @@
 
 Base first, then metadata, stills by utility, the backlog. Five threads send:
 
-* the frame loop: `base`, `status`, `pose`, and what it stores in place of sending; it waits for video alone;
+* the frame loop: `base`, `status`, `pose`, and the objects that it stores instead; it waits for video alone;
 * the stills' thread: `tracks` and `still`;
-* that of requested stills: `still`;
+* the thread of requested stills: `still`;
 * the store's thread: `backlog`;
-* the link's callbacks: `reply`, what grounds asked of ``info`` and ``control``, and `resend`, what one misses.
+* the link's callbacks: `reply` to queries of ``info`` and ``control``, and `resend` of missing access units.
 
 The lock covers header, ledger and budget, never a wait or a ``put``. So a still whose ``put`` blocks holds up stills
 alone; a base frame finds the lock free and a publisher of its own.
 
-``now_ns`` is the time that windows go by: the wall clock in real time, media time in lockstep, so that the same input
-gives the same stills. It is also the time of sending that goes on the wire, so that the ground's ledger has the very
-same windows.
+``now_ns`` is the time of the budget's windows: the wall clock in real time, media time in lockstep, so that the same
+input gives the same stills. It is also the send time on the wire, so that the ground's ledger has exactly the same
+windows.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from hvt_edge.link.pacer import BaseInFlight, Pacer
 from hvt_edge.link.stills import Still
 
 STILL_ATTACHMENT_BYTES = 55
-"""About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
-`Transmitter.still_allowance_bytes` of one that is counts its own header."""
+"""Typical size of the `RoiHeader` of one track with the usual names: for estimates before a still exists.
+`Transmitter.still_allowance_bytes` of an existing still counts its own header."""
 BACKLOG_ATTACHMENT_BYTES = 48
 """The largest `BacklogHeader`."""
 LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
-"""A chunk occupies the link so long at most, so a frame or a live still need not wait for it."""
+"""Longest time that a chunk occupies the link, so that a frame or a live still need not wait for it."""
 _RESEND_WAIT_NS = 150_000_000
 _GROWTH_BYTES = 16
 """Growth of a message that is made for a later moment: its two times."""
@@ -66,7 +66,7 @@ class Chunk:
 
 
 class Outlet(Protocol):
-    """Takes the bytes: the link, or in the study nothing."""
+    """Takes the bytes: the link, or in the study a sink."""
 
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
@@ -79,9 +79,9 @@ class Outlet(Protocol):
 class Transmitter:
     """Sends access units, stills, tracks and status, and accounts for each.
 
-    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` counts all that
-    goes out, and holds stills while the link is busy. ``in_flight`` holds access units until they are reported.
-    ``clock`` is the time of the windows where it passes while a still is coded; None in lockstep.
+    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` counts every
+    message sent, and holds stills while the link is busy. ``in_flight`` holds access units until they are reported.
+    ``clock`` gives the windows' time where time passes while a still is coded; None in lockstep.
     """
 
     outlet: Outlet
@@ -96,7 +96,7 @@ class Transmitter:
     in_flight: BaseInFlight = field(default_factory=BaseInFlight)
     clock: Callable[[], int] | None = None
     class_names: tuple[str, ...] = ()
-    """Those of `Info`: a still that a ground is known to have it for names its class by the index."""
+    """The names of `Info`: for a ground known to have it, a still names its class by the index."""
 
     def __post_init__(self) -> None:
         self._keys = EdgeKeys(self.edge_id)
@@ -106,7 +106,7 @@ class Transmitter:
         """Index of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
         self.base_waited_ns = 0
-        """How long base messages have waited for the budget's window, all together."""
+        """Total time for which base messages have waited for the budget's window."""
         self._captures = CaptureTimes()
         self._packed: tuple[RoiHeader, PackedMessage] | None = None
         self._ended = False
@@ -114,10 +114,10 @@ class Transmitter:
     def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False, announced: bool = True) -> int:
         """Send one access unit as soon as the budget's window has room for it; return its line bytes.
 
-        0 where it is not sent, because no window has room for it, or no message (`holds`): a keyframe has to follow.
-        ``after_hole``: frames that it builds on were not sent. A number is left out, so that nobody shows it.
-        ``announced``: stills yield to a keyframe beforehand; else the budget keeps room for another that comes by
-        itself.
+        Returns 0 where it is not sent, because no window has room for it, or no message (`holds`): a keyframe has to
+        follow. ``after_hole``: frames that it builds on were not sent. A sequence number is left out, so that no
+        ground shows it. ``announced``: stills yield to a keyframe beforehand; else the budget keeps room for later
+        keyframes that come unannounced.
         """
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
@@ -152,10 +152,10 @@ class Transmitter:
         )
 
     def resend(self, missing: Sequence[int], *, now_ns: int) -> None:
-        """Send access units that the primary receiver misses once more, before those that are yet to come.
+        """Send access units that the primary receiver misses once more, before units that are yet to come.
 
-        What has no room in the budget's window within `_RESEND_WAIT_NS`, or is beyond the share of such messages, may
-        go at the next report, and so may those behind it, which are of no use without.
+        A unit without room in the budget's window within `_RESEND_WAIT_NS`, or beyond the share of such messages, may
+        go at the next report, and so may the units behind it, which are of no use without it.
         """
         for sequence in () if self.lockstep else missing:
             now_ns = now_ns if self.clock is None else max(now_ns, self.clock())
@@ -182,9 +182,9 @@ class Transmitter:
     def still_allowance_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
         """Payload that a still with the header of this one may take now, whatever data it holds itself.
 
-        True to the byte: all that differs between still and still is counted (names, parameters, further tracks,
-        media type). Without a still it is an estimate for one with the usual names. Not ``paced`` it is what the
-        budget allows, whether or not the link is free at this moment.
+        Exact to the byte: all that differs between stills is counted (names, parameters, further tracks,
+        media type). Without ``still`` it is an estimate for one with the usual names. Without ``paced`` it is the
+        budget's allowance, whether or not the link is free at this moment.
         """
         with self._lock:
             line_bytes = self.budget.still_allowance(now_ns)
@@ -199,11 +199,11 @@ class Transmitter:
         return self._payload(line_bytes, still, now_ns)
 
     def link_is_free(self, now_ns: int) -> bool:
-        """Whether a still may go as far as the link is concerned."""
+        """Whether the link is free for a still."""
         return self.pacer is None or self.pacer.admits_still(now_ns)
 
     def want_requested(self, size_bytes: int | None, *, now_ns: int) -> None:
-        """A requested still of so many payload bytes waits for its room; None: none waits any more."""
+        """A requested still of ``size_bytes`` payload waits for its room; None: none waits any more."""
         with self._lock:
             if size_bytes is None:
                 self.budget.want_requested(None, now_ns=now_ns)
@@ -212,12 +212,12 @@ class Transmitter:
             self.budget.want_requested(min(line_bytes, self.budget.most_requested_bytes), now_ns=now_ns)
 
     def most_requested_bytes(self) -> int:
-        """About the payload of the largest still that a ground may have at the present rates."""
+        """Approximate payload of the largest still that a ground can be sent on request at the present rates."""
         with self._lock:
             return self._usual_payload(self.budget.most_requested_bytes)
 
     def most_still_bytes(self) -> int:
-        """About the payload of the largest still that the budget ever admits."""
+        """Approximate payload of the largest still that the budget ever admits."""
         return self._usual_payload(self.budget.most_still_bytes)
 
     def still(self, still: Still, *, now_ns: int, copy: str = "", requested: bool = False) -> None:
@@ -225,8 +225,8 @@ class Transmitter:
 
         ``requested`` by a ground: `requested_allowance_bytes` admitted it.
 
-        It goes when it is coded, which is later than ``now_ns``. Where another thread has taken the allowance since,
-        it waits until there is one again, as everything does.
+        It is sent once it is coded, which is later than ``now_ns``. Where another thread has taken the allowance
+        since, it waits until there is room again, as every message does.
         Its outcome is noted with its bytes: ``sent``, or ``dropped`` once the run has ended.
         """
         with self._lock:
@@ -251,13 +251,13 @@ class Transmitter:
         self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=still.encoding)
 
     def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
-        """An access unit is stored: it has used up its share, and left nothing of it to a still."""
+        """Count an access unit that is stored: it has used up its share, of which a still can borrow nothing."""
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
             self.budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, stored=True)
 
     def store_still(self, still: Still, *, now_ns: int, counted: bool = True) -> BacklogStill:
-        """The still as it would have gone out, for the backlog; ``counted``: its share of the budget is taken."""
+        """The still as it would have been sent, for the backlog; ``counted``: its share of the budget is taken."""
         attachment = self._header_at(still, now_ns, stored=True).pack(still.data)
         if counted:
             line_bytes = self._line_bytes(Channel.ROI, still.data, len(attachment), encoding=still.encoding)
@@ -285,7 +285,7 @@ class Transmitter:
     def backlog(self, chunk: Chunk, *, now_ns: int) -> int:
         """Send a chunk that `backlog_allowance_bytes` admitted at this very time; return its line bytes.
 
-        0: another thread has taken the allowance since, and it was not sent.
+        Returns 0 where another thread has taken the allowance since: the chunk was not sent.
         """
         session_id, kind, number = chunk.key
         header = BacklogHeader(
@@ -317,14 +317,14 @@ class Transmitter:
         before_frames: bool = False,
         last: bool = False,
     ) -> bool:
-        """Send what belongs to neither stream, where the next frame keeps its room; else False: try again.
+        """Send a message of neither stream, where the next frame keeps its room; else return False: try again.
 
-        ``before_frames``: one that has waited long goes as soon as it fits. The ``last`` one, of ``status``, waits
-        until it does.
+        ``before_frames``: a message that has waited long goes as soon as it fits. The ``last`` one, of ``status``,
+        waits until it fits.
 
-        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment. Behind the
-        ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
-        closes the session.
+        ``make(at_ns)`` runs while no other message is counted: all it reads of the ledger is of one moment. After the
+        ``last`` message no stills and no tracks are sent, whichever thread still has some: a ground that has received
+        everything named in it closes the session.
         """
         at_ns = now_ns
         with self._lock:
@@ -348,10 +348,10 @@ class Transmitter:
     def reply(self, channel: Channel, payload: bytes) -> bytes:
         """Count an answer to a query, and let it go at once: the link puts it on the line as this returns.
 
-        It waits for no window and takes none of the budget. Until a query is answered, those behind it stand still,
-        and with them in the end all that the link takes in, keyframe requests and reports; who asks measures the
-        clock by the time that the answer takes; and if answers took from the budget, anybody who may ask could stop
-        the video. Its bytes have an account of their own, since each ground sees only those that it asked for.
+        It waits for no window and takes none of the budget. Until a query is answered, later queries stand still, and
+        in the end all that the link receives, keyframe requests and reports too; the requester measures the clock by
+        the time that the answer takes; and if answers took from the budget, any ground that may query could stop the
+        video. Its bytes have an account of their own, since each ground sees only the answers that it requested.
         """
         overhead = overhead_bytes(
             len(payload), 0, key=self._keys.key(channel), encoding=DELIVERIES[channel].encoding, reply=True
@@ -383,7 +383,7 @@ class Transmitter:
         return len(unit.data) <= MAX_PAYLOAD_BYTES and self.budget.holds(line_bytes)
 
     def outcome(self, outcome: str, reason: str) -> None:
-        """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""
+        """Note the outcome of a candidate: ``sent``, ``deferred`` or ``dropped``, and its reason."""
         assert outcome in ("sent", "deferred", "dropped")
         with self._lock:
             self.ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
@@ -396,7 +396,7 @@ class Transmitter:
         return self.budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
 
     def _header_at(self, still: Still, send_ns: int, *, stored: bool = False) -> PackedMessage:
-        # As it goes out at this time. The newest is packed once, however often it is asked for.
+        # The header as sent at this time. The newest is packed once, however often it is requested.
         header, packed = still.header, self._packed
         if packed is None or packed[0] is not header:
             sent = replace(
@@ -407,7 +407,7 @@ class Transmitter:
             )
             self._packed = packed = header, PackedMessage.of(sent)
         fields = {"send_delay_ns": send_ns - header.capture_ns}
-        # Who asks need not have the video, nor the session's facts; nor will they be at hand where a still is stored.
+        # A requester need not have the video, nor the session's facts; nor does a ground when a stored still arrives.
         if not stored and "ask" not in header.parameters:
             if self._captures.knows(self.session_id, header.frame_index):
                 fields["capture_ns"] = -1
@@ -455,7 +455,7 @@ class Transmitter:
         return len(payload) + self._around(channel, len(payload), attachment_bytes, encoding=encoding)
 
     def _around(self, channel: Channel, size_bytes: int, attachment_bytes: int, *, encoding: str = "") -> int:
-        # Line bytes of a message beside so many of payload.
+        # Line bytes of a message beside its ``size_bytes`` of payload.
         return attachment_bytes + overhead_bytes(
             size_bytes,
             attachment_bytes,
