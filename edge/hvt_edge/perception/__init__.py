@@ -1,6 +1,6 @@
 """Decoded base and source in, tracks and candidates out: `analyzer`, `candidates`.
 
-`candidates` says too where a still is cut and what the base lost there. `shadow` measures what the ground would miss,
-and how far the ground's own count differs; by that `levers` decides what ``auto`` sends. `frame_ring` keeps source
-frames. `cpu_budget` decides what of this runs when the processor is scarce.
+`candidates` also cuts stills and measures the base's loss there. `shadow` measures the ground's missed detections,
+and how far the ground's own count differs; from that `levers` decides whether ``auto`` sends tracks and stills.
+`frame_ring` stores source frames. `cpu_budget` decides which parts run when the processor is scarce.
 """

@@ -21,24 +21,24 @@ from hvt_edge.perception.cpu_budget import CpuBudget
 
 @dataclass(frozen=True, slots=True)
 class AnalyzedFrame:
-    """One source frame with all that is known of it."""
+    """One source frame with its base picture, its tracks and the state of detection."""
 
     frame: Frame
     base: Picture | None
-    """The decoded base frame: what the ground has, and what a still may build on. None where the frame is not coded:
-    no still applies to it then."""
+    """The decoded base frame, as the ground has it: a still may build on it. None where the frame is not coded: no
+    still applies to it then."""
     tracks: Tracks
     detected: bool
-    """A decision step: the detector ran on this frame."""
+    """Whether this is a decision step: the detector ran on this frame."""
     tracked: bool = True
-    """False where nobody used what would be known of it: it was neither decoded nor searched, and has no tracks."""
+    """False where nobody would use the results: the frame was neither decoded nor searched, and has no tracks."""
     scene_began: int = -1
-    """The newest frame that another scene began with, as the tracker saw; -1 before any."""
+    """The newest frame with which another scene began, by the tracker; -1 before any."""
     _bgr: list[Image] = field(default_factory=list, compare=False, repr=False)
 
     @property
     def base_bgr(self) -> Image | None:
-        """`base` in BGR, converted once: only decision steps look at it."""
+        """`base` in BGR, converted once: only decision steps use it."""
         if self.base is None:
             return None
         if not self._bgr:
@@ -49,14 +49,14 @@ class AnalyzedFrame:
 class Analyzer:
     """Decodes the edge's own access units, detects on every n-th frame and tracks on each.
 
-    ``candidates`` says on which pixels the detector runs and the tracker follows the camera. Of the source means
-    before it is coded, at the finer of its two sizes: a source that the base enlarges is analyzed enlarged, as by the
-    ground's detector, which finds less in fewer pixels. ``detect_every`` source frames are from one detection to the
-    next, see `analyze` for streams that code fewer; up to ``detect_still_every`` while nothing changes.
+    ``candidates`` says on which pixels the detector runs and the tracker follows the camera. "source" means before
+    coding, at the finer of the two sizes: a source that the base enlarges is analyzed enlarged, as by the ground's
+    detector, which finds less in fewer pixels. ``detect_every`` counts source frames from one detection to the next,
+    see `analyze` for streams that code fewer; up to ``detect_still_every`` while nothing changes.
 
-    While the detector gives None the tracks are carried on. ``trust`` is told what it finds. ``search`` finds the
-    scale; without it that is as given. A detection that is due waits until ``cpu_budget`` admits it; decoding and
-    tracking never do.
+    While the detector gives None the tracks are carried on. ``trust`` receives its detections. ``search`` finds the
+    scale; without it the scale is as given. A detection that is due waits until ``cpu_budget`` admits it; decoding
+    and tracking never do.
     """
 
     def __init__(
@@ -82,18 +82,18 @@ class Analyzer:
         self._decoder = BaseDecoder()
         self._detected_index: int | None = None
         self.detected_ns: int | None = None
-        """Capture time of the newest picture that was searched for objects; None before the first."""
+        """Capture time of the newest frame that was searched for objects; None before the first."""
         self._coded_index: int | None = None
         self._coded_gap = 1
         self._track_ids = SequenceWindow()
         self.spent_ns = 0
         """Time to decode, detect and track so far."""
         self.frames = 0
-        """How many were analyzed."""
+        """Number of frames analyzed."""
 
     @property
     def detect_every(self) -> int:
-        """Source frames from one detection to the next, where there is time for it and each of them is coded."""
+        """Source frames from one detection to the next, if there is time for it and all of them are coded."""
         return self._every if self._search is None else self._search.interval(self._every)
 
     @property
@@ -116,13 +116,13 @@ class Analyzer:
         *,
         skipped: Sequence[AccessUnit] = (),
     ) -> AnalyzedFrame:
-        """Take in the next source frame; ``unit`` is None where it is not coded.
+        """Analyze the next source frame; ``unit`` is None where it is not coded.
 
         Detection is due ``detect_every`` frames after the last one. With candidates of the decoded stream that can
         only be a coded frame. With candidates of the source it waits for a coded frame too, as long as those are no
-        further apart than ``detect_every``; where they are, detection runs at its own pace and at each coded frame
-        besides, so that stills are always chosen by what that very picture shows. ``skipped`` are the units since
-        the frame before, of frames that were not analyzed: they are decoded and no more.
+        further apart than ``detect_every``; otherwise detection runs at its own pace and at each coded frame
+        besides, so that stills are always chosen by detections of that very frame. ``skipped`` are the units since
+        the frame before, of frames that were not analyzed: they are only decoded.
         """
         began_ns = time.perf_counter_ns()
         for one in skipped:
@@ -136,10 +136,10 @@ class Analyzer:
     def pass_over(
         self, frame: Frame, unit: AccessUnit | None, *, skipped: Sequence[AccessUnit] = ()
     ) -> AnalyzedFrame:
-        """Take in the next source frame for nobody: nothing is searched or tracked.
+        """Pass the next source frame without use for its results: it is neither searched nor tracked.
 
-        What is coded is decoded all the same (3 ms at 1280x720), so that `analyze` can go on from any frame, and a
-        requested still has the base to beat.
+        A coded frame is decoded all the same (3 ms at 1280x720), so that `analyze` can go on from any frame, and a
+        requested still has a base to compare with.
         """
         for one in skipped:
             self._decode(one.frame_index, one)
@@ -182,7 +182,7 @@ class Analyzer:
         return picture
 
     def _due(self, index: int, *, coded: bool) -> bool:
-        # Whether the detector is to run on this frame. By frame counts alone, never by a clock.
+        # Whether the detector is to run on this frame. It depends on frame counts alone, never on a clock.
         every, last = self.detect_every, self._detected_index
         rested = (
             last is None
@@ -200,7 +200,7 @@ class Analyzer:
         return whole if whole is None or self._search is None else self._search.take(whole, image_bgr)
 
     def _detect(self, frame: Frame, base_bgr: Sequence[Image]) -> Detections | None:
-        # ``base_bgr`` is the one decoded picture, where candidates are of that.
+        # ``base_bgr`` is the one decoded picture, if candidates come from the decoded stream.
         if self._candidates == "decoded":
             assert base_bgr, "detection on the decoded stream is due on coded frames only"
             return self._found(base_bgr[0])
@@ -211,7 +211,7 @@ class Analyzer:
             return None
         width, height = self._view.base_size
         boxes = self._view.to_base(found.boxes_xyxy_px)
-        # With --fit crop the source shows more than the base does; what lies outside is no candidate.
+        # With --fit crop the source shows more than the base does; objects outside the base are no candidates.
         limits = np.array([width, height, width, height], np.float32)
         boxes = np.clip(boxes, 0, limits)
         inside = (boxes[:, 2] - boxes[:, 0] > 1) & (boxes[:, 3] - boxes[:, 1] > 1)

@@ -1,8 +1,8 @@
 """Candidates: the tracks of one decision step, each with its crop and the edge's memory of it.
 
-Methods and suppression see nothing else, so that they can be pure functions. The edge decodes its own stream, so it
-knows exactly what the ground sees of a crop: the gate sends no still where nothing was lost, and M6 asks first for
-what lost most.
+Methods and suppression see only candidates, so that they can be pure functions. The edge decodes its own stream, so
+it knows exactly how the ground sees a crop: the gate sends no still where nothing was lost, and M6 first requests the
+crops that lost most.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ PADDING = 0.15
 MIN_SIDE_PX = 8
 """No crop is narrower or lower than one JPEG block."""
 MOST_PSNR_DB = 99.0
-"""Said of identical crops, where the formula has no finite value."""
+"""The value for identical crops, where the formula has no finite one."""
 _BT601 = np.array([[0.114, 0.587, 0.299]], np.float32)
 _DETAIL_SIDE_PX = 224
-"""Classifiers see no more pixels than that; finer detail than theirs is nobody's loss."""
+"""Input size of usual classifiers; the loss of finer detail changes no class."""
 _NOISE_ENERGY = 20.0
 """Energy of the Laplacian (0 1 0, 1 -4 1, 0 1 0) of noise of one grey level, 4 · 1 + 16: less is no detail."""
 
@@ -71,8 +71,8 @@ def measure_loss(source_crop: Image, base_crop: Image) -> BaseLoss:
 
     With ``S`` and ``B`` the Laplacians of both lumas (BT.601), ``detail_lost = sum(S (S - B)) / (sum(S S) + noise)``:
     0 where the base has all edges of the source, 1 where it has none of them, 0.5 where it has them at half their
-    contrast. What the base adds (ringing, blocks) is no loss of detail; it is in the PSNR. A crop without detail
-    loses none: noise of one grey level stands in the denominator. A longer side is brought to 224 pixels first
+    contrast. Artefacts of the base (ringing, blocks) are no loss of detail; they count in the PSNR. A crop without
+    detail loses none: noise of one grey level stands in the denominator. A longer side is shrunk to 224 pixels first
     (area means). 0.03 ms for 64x64 pixels, 0.5 ms for 256x256.
     """
     assert source_crop.shape == base_crop.shape, "both crops have one size"
@@ -87,7 +87,7 @@ def measure_loss(source_crop: Image, base_crop: Image) -> BaseLoss:
 
 
 def _detail(luma: cv2.typing.MatLike) -> cv2.typing.MatLike:
-    # The Laplacian, at the size at which it counts.
+    # The Laplacian, at the size at which detail counts.
     shrink = max(luma.shape[:2]) / _DETAIL_SIDE_PX
     if shrink > 1:
         size = (max(1, round(luma.shape[1] / shrink)), max(1, round(luma.shape[0] / shrink)))
@@ -103,7 +103,7 @@ _SHARPNESS_SIDE_PX = 64
 
 @dataclass(frozen=True, slots=True)
 class ClassPosterior:
-    """The answer of the ground's classifier for a track, from ``feedback``."""
+    """The ground classifier's answer for a track, from ``feedback``."""
 
     class_name: str
     confidence: float
@@ -137,9 +137,9 @@ class Candidate:
     border_s: float = 0.0
     """For how long it has touched the border without a break."""
     leaving: bool = False
-    """Touches the border, and less of it shows than before."""
+    """The box touches the border, and less of the object shows than before."""
     covered_share: float = 0.0
-    """The largest share of the box that one track in front covers; the one that reaches lower down is in front."""
+    """The largest share of the box that one track in front covers; the box that reaches lower down is in front."""
     sent_count: int = 0
     last_sent_frame: int | None = None
     last_sent_ns: int | None = None
@@ -153,8 +153,8 @@ class Candidate:
     sharpness: Callable[[], float] | None = field(default=None, compare=False, repr=False)
     """Measures the source crop when called; None where no picture was at hand."""
     loss: Callable[[], BaseLoss] | None = field(default=None, compare=False, repr=False)
-    """Measures, once, what the base shows of the crop against the source, at the base's own grid where that is the
-    coarser; None where a picture was not at hand."""
+    """Measures, once, the base's loss at the crop against the source, on the base's own grid if that is the coarser;
+    None where a picture was not at hand."""
 
     @property
     def area_px(self) -> float:
@@ -165,7 +165,7 @@ class Candidate:
 def sharpness(crop_bgr: Image) -> float:
     """Variance of the Laplacian at a fixed size: higher is sharper. 0.1 ms.
 
-    The crop is brought to 64 by 64 pixels first, so that an object that comes nearer and shows more detail
+    The crop is resized to 64 by 64 pixels first, so that an object that comes nearer and shows more detail
     scores higher.
     """
     grey = cv2.cvtColor(crop_bgr, cv2.COLOR_BGR2GRAY)
@@ -190,14 +190,14 @@ class _History:
 
 
 _REMEMBERED = {one.name for one in fields(_History)} & {one.name for one in fields(Candidate)}
-"""What a candidate says of the past of its track."""
+"""The fields that a candidate copies from the history of its track."""
 
 
 class TrackMemory:
     """Remembers the start of each track, its stills and the ground's answers.
 
-    Bounded: a track that has not been seen for ``forget_s`` is forgotten, and beyond ``max_tracks`` those seen
-    longest ago go first.
+    Bounded: a track not seen for ``forget_s`` is forgotten, and beyond ``max_tracks`` the tracks seen longest ago
+    are forgotten first.
     """
 
     def __init__(
@@ -217,11 +217,11 @@ class TrackMemory:
         return len(self._histories)
 
     def observe(self, tracks: Tracks, *, now_ns: int) -> None:
-        """Note which tracks there are; call it on every frame, so that no start between two steps is missed."""
+        """Note the present tracks; call it on every frame, so that no start between two steps is missed."""
         for track_id, started in zip(tracks.ids.tolist(), tracks.started.tolist(), strict=True):
             history = self._histories.get(track_id)
             if history is None:
-                # New to us is a start as well: the tracker may list a track later than it made it.
+                # A track that is new here has started as well: the tracker may list it later than it made it.
                 history = _History(seen_ns=now_ns, start_frame=tracks.frame_index)
                 self._histories[track_id] = history
             elif started:
@@ -230,7 +230,7 @@ class TrackMemory:
         self._forget(now_ns)
 
     def record_sent(self, candidate: Candidate, *, frame_index: int, now_ns: int) -> None:
-        """Note that a still of it went out; ``frame_index`` is the frame that it shows."""
+        """Note that a still of the candidate was sent; ``frame_index`` is the frame that it shows."""
         history = self._histories.get(candidate.track_id)
         if history is None:
             return
@@ -242,7 +242,7 @@ class TrackMemory:
         history.last_sent_at_border = candidate.touches_border
 
     def record_refused(self, track_id: int, *, now_ns: int) -> None:
-        """Note that the still stage had no still for it; suppression then lets it rest for a while."""
+        """Note that the still stage had no still for the track; suppression then lets it rest for a while."""
         history = self._histories.get(track_id)
         if history is not None:
             history.last_refused_ns = now_ns
@@ -265,10 +265,10 @@ class TrackMemory:
         source_bgr: Image | None = None,
         base_bgr: Image | None = None,
     ) -> list[Candidate]:
-        """One candidate a track, ordered by id.
+        """One candidate for each track, ordered by id.
 
-        ``source_bgr`` and ``base_bgr``, the decoded base frame of the same index, are only read if someone asks for
-        sharpness or loss.
+        ``source_bgr`` and ``base_bgr``, the decoded base frame of the same index, are read only when sharpness or
+        loss is called.
         """
         self.observe(tracks, now_ns=now_ns)
         picture = _picture(view)
@@ -327,7 +327,7 @@ class TrackMemory:
 
 
 def _picture(view: View) -> Box:
-    # Where the source lies inside the base frame, base pixels; letterbox borders are not picture.
+    # The source's area inside the base frame, base pixels; letterbox borders are not picture.
     x1, y1, x2, y2 = view.to_base(np.array([[0, 0, *view.source_size]], np.float32))[0].tolist()
     return max(x1, 0.0), max(y1, 0.0), min(x2, float(view.base_size[0])), min(y2, float(view.base_size[1]))
 
@@ -348,7 +348,7 @@ def _note_border(history: _History, box_base_px: Box, *, picture: Box, now_ns: i
 
 
 def _covered_shares(boxes_base_px: Boxes) -> list[float]:
-    # By a box that reaches lower down, hence stands in front; from straight above boxes hardly overlap.
+    # Share covered by a box that reaches lower down, hence stands in front; from straight above boxes hardly overlap.
     if not len(boxes_base_px):
         return []
     x1, y1, x2, y2 = boxes_base_px.T
@@ -370,7 +370,7 @@ def _sharpness_of(source_bgr: Image, crop_source_px: tuple[int, int, int, int]) 
 def _loss_of(
     source_bgr: Image, base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View
 ) -> Callable[[], BaseLoss]:
-    # Measures the loss by coding, not by the size of the base: detectors there see its grid and no finer.
+    # Measures the loss by coding, not by the size of the base: detectors there work on its grid and no finer.
     x1, y1, x2, y2 = crop_source_px
     shrink = max(1.0, 1 / view.scale, max(x2 - x1, y2 - y1) / MAX_SIDE_PX)
     size = (max(1, round((x2 - x1) / shrink)), max(1, round((y2 - y1) / shrink)))

@@ -1,11 +1,11 @@
-"""What of perception runs, for want of processor: one decides, by what each part was measured to take.
+"""Decides which parts of perception run when the processor is scarce, by the measured cost of each part.
 
-Capture, coding and sending have no turn here: they go before all else. Perception has a budget of its own, a share of
-the processors (`most_cores`), and no more than video leaves of them. It is given out in the order of `share_out`.
-No measure of a second shows what stands in a frame's way, so a frame that video loses says more: each halves the
-budget, which comes back in a while. Stills are chosen at looks, and are as rare as these.
+Capture, coding and sending are not scheduled here: they always come first. Perception has a budget of its own, a
+share of the processors (`most_cores`), and no more than video leaves of them. `share_out` gives it out in order.
+A measurement over a second does not show delays of single frames, so each frame that video loses halves the
+budget, which comes back in a while. Stills are chosen at detections, and are as rare as these.
 
-Time is an argument, but for the processor time that a part takes.
+Time is an argument, except the processor time of each part.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from typing import Final, Literal
 from hvt_common.units import SECOND_NS
 
 Part = Literal["track", "detect", "compare", "choose"]
-"""Tracking through one frame; the detector on the source; the detector on the base, for the shadow ground; stills."""
+"""Tracking through one frame; detection on the source; detection on the base, for the shadow ground; stills."""
 
 LONGEST_DETECT_S: Final = 5.0
-"""Where a look comes later than that, the machine is too slow for the detector."""
+"""If a detection comes later than this, the machine is too slow for the detector."""
 _LONGEST_TRACK_S: Final = 0.5
-"""Boxes come twice a second, however little there is."""
+"""Boxes come twice a second, however little processor time there is."""
 _MOST_TRACKING: Final = 0.5
 _MOST_DETECTING: Final = 0.85
-"""Shares of what the parts before have left."""
+"""Shares of the cores that the earlier parts have left."""
 _LEAST_CORES: Final = 0.5
 _SHARE: Final = 0.5
-"""With fewer looks than three a second nothing is tracked from a camera that moves: with 1.5 a third is (car10)."""
+"""With fewer than 3 detections a second nothing is tracked from a moving camera: with 1.5 a third is (car10)."""
 _IDLE: Final = 0.1
-"""Share of the processors that nobody is given: a process that takes all that its control group allows stands still
+"""Share of the processors given to no part: a process that uses all that its control group allows is halted
 for the rest of each tenth of a second, and its video with it."""
 _LEAST_LEFT: Final = 1 / 16
-"""Of the budget, however many frames are lost."""
+"""Least share of the budget, however many frames are lost."""
 _BACK_S: Final = 5.0
-"""In so long the budget doubles again."""
+"""Time in which the budget doubles again."""
 _LOSS_NS: Final = SECOND_NS // 4
-"""Frames lost within that are one loss."""
+"""Frames lost within this time count as one loss."""
 _START_NS: Final = SECOND_NS
-"""Frames lost so soon say nothing: the first is the dearest to code, and all else begins beside it."""
+"""Frames lost this early say nothing: the first is the dearest to code, and all other parts begin beside it."""
 _MOST_QUEUED: Final = 3
-"""With more frames behind the one in hand nothing is searched: they would wait as long again."""
+"""With more frames behind the one in hand detection is left out: they would wait as long again."""
 _NEWEST: Final = 0.3
-"""Weight of the newest cost."""
+"""Weight of the newest cost in the mean."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Least seconds from one turn of a part to its next; 0: whenever it likes."""
+    """Least seconds from one turn of a part to its next; 0: no limit."""
 
     track_s: float = 0.0
     detect_s: float = 0.0
@@ -59,17 +59,17 @@ class Plan:
 
 
 def most_cores(processors: float, *, others: float = 0.0) -> float:
-    """Cores, of so many, that perception may take where the rest of this process takes ``others``."""
+    """Cores that perception may take of ``processors``, if the rest of this process takes ``others``."""
     return min(max(_LEAST_CORES, _SHARE * processors), max(0.0, (1 - _IDLE) * processors - others))
 
 
 def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
-    """The plan for so many cores, where one turn of each part takes so many seconds of one.
+    """The plan for ``cores``; ``costs`` are the core seconds of one turn of each part.
 
     | order | part | gets | at least |
     |---|---|---|---|
     | 1 | track | each frame, for half of the cores at most | twice a second |
-    | 2 | detect, with its stills | .85 of what is left | each 5 s |
+    | 2 | detect, with its stills | .85 of the remaining cores | each 5 s |
     | 3 | compare | the rest | never |
     """
     track, detect, compare, choose = (
@@ -89,9 +89,9 @@ def _every_s(cost_s: float, cores: float, *, longest_s: float) -> float:
 
 
 class CpuBudget:
-    """Gives turns, and takes what they took. With endless ``processors``, as in lockstep, each gets all it asks for.
+    """Admits turns, and measures their cost. With infinite ``processors``, as in lockstep, it admits every turn.
 
-    The frame loop gives frames and measures, the thread of perception takes the other turns: a value has one writer.
+    The frame loop reports frames and costs, perception's thread takes the other turns: each value has one writer.
     """
 
     def __init__(
@@ -103,21 +103,21 @@ class CpuBudget:
     ) -> None:
         self._fps, self._processors = fps, processors
         self._others = _SHARE * processors if math.isfinite(processors) else 0.0
-        """Cores that the rest of this process takes. A mean: a look that ends in the next second counts there."""
+        """Cores used by the rest of this process. A mean: a detection that ends in the next second counts there."""
         self._spent_ns = spent_ns
         self._costs: dict[Part, float] = {}
         self._had_ns: dict[Part, int] = {}
         self._perceived_ns = 0
         self._measured: tuple[int, int] | None = None
-        """When, and perception's processor time until then."""
+        """Time of the last measurement, and perception's processor time until then."""
         self._lost, self._lost_ns, self._left = 0, 0, 1.0
         self._waits_ns: int | None = None
-        """Of the frames since the detector was last not due, or came to look: the first."""
+        """The first frame since the detector last ran, or was last not due."""
         self._newest_ns = 0
         self.queued = 0
         """Frames behind the one in hand."""
         self.keyframe_soon = False
-        """The detector waits until it is coded, which takes video longer than any other frame."""
+        """The detector waits until a due keyframe is coded: video takes longer for it than for any other frame."""
 
     @property
     def plan(self) -> Plan:
@@ -128,14 +128,14 @@ class CpuBudget:
 
     @property
     def too_slow(self) -> bool:
-        """Whether the detector has not come to look for so long that its boxes tell nothing."""
+        """Whether the detector has not run for so long that its boxes are useless."""
         waits_ns = self._waits_ns
         return waits_ns is not None and self._newest_ns - waits_ns > (LONGEST_DETECT_S + 1) * SECOND_NS
 
     def admits_frame(self, at_ns: int, *, lost: int, late: bool) -> bool:
-        """Whether perception gets the frame of that capture time; ``lost``: so many video has lost until now.
+        """Whether perception gets the frame of that capture time; ``lost``: frames that video has lost so far.
 
-        None while the loop is ``late`` itself.
+        No frame is admitted while the loop is ``late`` itself.
         """
         self._waits_ns = at_ns if self._waits_ns is None else self._waits_ns
         if not self._newest_ns:
@@ -150,24 +150,24 @@ class CpuBudget:
         return not late and self._take("track", self.plan.track_s, at_ns)
 
     def admits_detection(self, at_ns: int, *, due: bool = True) -> bool:
-        """Whether the detector searches the source of that frame, where that is ``due``."""
+        """Whether the detector searches the source of that frame, if a detection is ``due``."""
         admitted = due and self._has_time and self._take("detect", self.plan.detect_s, at_ns)
         if admitted or not due:
             self._waits_ns = None
         return admitted
 
     def admits_comparison(self, at_ns: int) -> bool:
-        """Whether it searches the base of that frame besides."""
+        """Whether the detector also searches the base of that frame."""
         return self._has_time and self._take("compare", self.plan.compare_s, at_ns)
 
     @property
     def _has_time(self) -> bool:
-        # For what takes longer than from one frame to the next.
+        # For parts that take longer than the time between two frames.
         waits = self.keyframe_soon and math.isfinite(self._processors)
         return self.queued < _MOST_QUEUED and not waits
 
     def _take(self, part: Part, every_s: float, at_ns: int) -> bool:
-        # Frames come when they come: the nearest to the plan is meant, not the first beyond.
+        # Frame times are given: the frame nearest to the plan is taken, not the first one after.
         had_ns, early_s = self._had_ns.get(part), 0.5 / self._fps
         if had_ns is not None and at_ns - had_ns < (every_s - early_s) * SECOND_NS:
             return False
@@ -176,7 +176,7 @@ class CpuBudget:
 
     @contextmanager
     def spending(self, part: Part) -> Iterator[None]:
-        """Measure a turn of this part, by the processor time of the calling thread."""
+        """Measure the cost of a turn of this part, in processor time of the calling thread."""
         began_ns = self._spent_ns()
         yield
         took_ns = self._spent_ns() - began_ns
@@ -185,7 +185,7 @@ class CpuBudget:
         self._costs[part] = before_s + _NEWEST * (took_ns / SECOND_NS - before_s)
 
     def measure(self, cores: float, *, now_ns: int) -> None:
-        """Take how many cores this process took since the last measure, about a second ago."""
+        """Add a measurement: the cores that this process took since the last one, about a second ago."""
         before, self._measured = self._measured, (now_ns, self._perceived_ns)
         if before is None or now_ns <= before[0]:
             return

@@ -1,15 +1,15 @@
 """The last seconds of untouched source frames, each with its tracks and its base picture, for stills on demand.
 
-The newest is there as the source gave it; those before it as 4:2:0, half the memory, which is what still codecs and
-cameras have anyway. Their bound is in bytes and in seconds. Where the bytes do not hold every frame of those seconds,
-frames are kept further apart, evenly, so that the ring reaches as far back as asked for: 24 MB hold one each 0.6 s at
+The newest is stored as the source gave it; older ones as 4:2:0, half the memory, which still codecs and
+cameras use anyway. They are bounded in bytes and in seconds. If the bytes do not hold every frame of those seconds,
+frames are stored further apart, evenly, so that the ring reaches as far back as set: 24 MB hold one each 0.6 s at
 1280x720, one each second at 1920x1080 and one of 5 s ago at 3840x2160.
 
-Frames that were coded are preferred: with them stands what the base shows, which a still has to beat. Of the others
-only the newest is kept, and one in so long where the video stands still.
+Coded frames are preferred: with them the base picture is stored, which a still has to beat. Of the others
+only the newest is stored, and one in each `_UNCODED_NS` where no frames are coded.
 
-Frames come here once they were analyzed, which on a slow machine takes seconds, and not all are. So the newest that
-the camera gave is held beside them, without tracks: it is what "now" means where no track is requested.
+Frames come here once they were analyzed, which on a slow machine takes seconds, and not all are. So the newest frame
+of the camera is held beside them, without tracks: it is "now" for requests without a track.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hvt_common.values import Frame, Image, Tracks
 from hvt_common.video.hevc import YuvPicture
 
 _UNCODED_NS = 6 * SECOND_NS // 10
-"""A frame that was coded stands for one that was not, so near: at two a second there is one."""
+"""Within this time a coded frame stands for an uncoded one: at two coded frames a second there always is one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +39,11 @@ class RingFrame:
     size: tuple[int, int]
     """(width, height) of the source in pixels."""
     pixels: npt.NDArray[np.uint8]
-    """The source's own, not copied: nobody may write into it. Or, where it has two dimensions, I420."""
+    """The source's own array, not copied: nobody may write into it. With two dimensions it is I420."""
     tracks: Tracks
-    """At this very frame, base pixels."""
+    """The tracks of this very frame, base pixels."""
     base: YuvPicture | Image | None = None
-    """What the base shows of this very frame; None where it was not coded."""
+    """The decoded base picture of this very frame; None where it was not coded."""
 
     @property
     def base_bytes(self) -> int:
@@ -61,7 +61,7 @@ class RingFrame:
         return self.pixels.nbytes // 2 if self._packs else self.pixels.nbytes
 
     def packed(self) -> RingFrame:
-        """The same in half the memory, where the sides are even."""
+        """The same frame in half the memory, if the sides are even."""
         if not self._packs:
             return self
         return replace(self, pixels=np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_BGR2YUV_I420), np.uint8))
@@ -72,19 +72,19 @@ class RingFrame:
 
 
 class FrameRing:
-    """One thread adds, one captures, others look; time is the frames' own.
+    """One thread adds, one captures, others read; time is the capture time of the frames.
 
-    Who wants a ``tracked`` frame gets one that was analyzed. ``max_bytes`` and ``max_age_ns`` bound all but the
-    newest; with no bytes, nothing is kept.
+    A ``tracked`` frame is one that was analyzed. ``max_bytes`` and ``max_age_ns`` bound all but the
+    newest; with no bytes, nothing is stored.
     """
 
     def __init__(self, *, max_bytes: int = 24_000_000, max_age_ns: int = 5_000_000_000) -> None:
         self._max_bytes, self._max_age_ns = max_bytes, max_age_ns
         self._frames: list[RingFrame] = []
-        """Oldest first; all but the newest, and the newest that was coded, are packed and lie on the grid that
+        """Oldest first; all but the newest, and the newest coded one, are packed and lie on the grid that
         `_spacing_ns` makes."""
         self._captured: RingFrame | None = None
-        """The newest from the camera, analyzed or not."""
+        """The newest frame of the camera, analyzed or not."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -92,23 +92,23 @@ class FrameRing:
 
     @property
     def size_bytes(self) -> int:
-        """Memory of the pixels, source and base, without the newest's."""
+        """Memory of the pixels, source and base, without those of the newest frame."""
         return sum(one.pixels.nbytes + one.base_bytes for one in self._frames[:-1])
 
     def newest(self, *, tracked: bool = True) -> RingFrame | None:
-        """The newest of all; None before the first, or where none is kept."""
+        """The newest frame; None before the first, or where none is stored."""
         with self._lock:
             frames = self._held(tracked=tracked)
             return frames[-1] if frames else None
 
     def newest_coded(self, *, tracked: bool = True) -> RingFrame | None:
-        """The newest frame that was coded; the newest of all where that is much newer, or none was."""
+        """The newest coded frame; the newest of all where that is much newer, or none was coded."""
         with self._lock:
             frames = self._held(tracked=tracked)
             return _nearest(frames, lambda one: frames[-1].capture_ns - one.capture_ns) if frames else None
 
     def capture(self, frame: Frame) -> None:
-        """The camera gave a frame, newer than all before."""
+        """Hold the camera's newest frame, newer than all before."""
         height, width = frame.source_bgr.shape[:2]
         if self._max_bytes:
             self._captured = RingFrame(
@@ -116,7 +116,7 @@ class FrameRing:
             )
 
     def add(self, frame: Frame, tracks: Tracks, *, base: YuvPicture | Image | None = None) -> None:
-        """Keep a frame, newer than all before; drop frames beyond the ring's room or time."""
+        """Store a frame, newer than all before; drop frames beyond the ring's bytes or time."""
         height, width = frame.source_bgr.shape[:2]
         newest = RingFrame(frame.index, frame.capture_ns, (width, height), frame.source_bgr, tracks, base)
         with self._lock:
@@ -125,7 +125,7 @@ class FrameRing:
             frames = self._frames
             if frames and frames[-1].base is None and self._stands_for(frames[-1]):
                 frames.pop()
-            # The last was kept for being the newest; unless it lies on the grid, it makes way for this one.
+            # The last frame was stored as the newest; unless it lies on the grid, it makes way for this one.
             last = frames[-1] if frames else None
             if last is not None and (base is not None or last.base is None):
                 frames.pop()
@@ -137,7 +137,7 @@ class FrameRing:
                 frames.pop(0)
 
     def near_time(self, capture_ns: int, *, tracked: bool = True) -> RingFrame | None:
-        """The frame kept that was taken nearest to this time; None where that is further back than the ring goes."""
+        """The stored frame nearest to this capture time; None where the time lies before the ring's oldest frame."""
         with self._lock:
             frames = self._held(tracked=tracked)
             if not frames or capture_ns < _reach_ns(frames):
@@ -145,7 +145,7 @@ class FrameRing:
             return _nearest(frames, lambda one: abs(one.capture_ns - capture_ns))
 
     def near_index(self, frame_index: int, *, tracked: bool = True) -> RingFrame | None:
-        """The frame kept whose index is nearest; None where that is further back than the ring goes, or to come."""
+        """The stored frame of the nearest index; None where the index is older than the ring, or yet to come."""
         with self._lock:
             frames = self._held(tracked=tracked)
             if not frames or not frames[0].frame_index <= frame_index <= self._last_index:
@@ -154,7 +154,7 @@ class FrameRing:
             return _nearest(frames, lambda one: abs(one.capture_ns - near.capture_ns))
 
     def _held(self, *, tracked: bool) -> Sequence[RingFrame]:
-        # All that may be requested, oldest first.
+        # All frames that may be requested, oldest first.
         newest, frames = self._captured, self._frames
         near = (
             bool(frames) and newest is not None and newest.capture_ns - frames[-1].capture_ns <= _UNCODED_NS
@@ -179,19 +179,19 @@ class FrameRing:
             return (self._frames[-1].capture_ns - self._frames[0].capture_ns) / 1e9
 
     def _spacing_ns(self, frame: RingFrame) -> int:
-        # The least time between two frames on the grid, for them to reach back all the seconds.
+        # The least time between two frames on the grid, such that they reach back all the seconds.
         count = self._max_bytes // (frame.packed_bytes + frame.base_bytes)
         return self._max_age_ns // max(1, count - 1)  # one more is about to grow too old
 
 
 def _nearest(frames: Sequence[RingFrame], distance_ns: Callable[[RingFrame], int]) -> RingFrame:
-    # The nearest of the frames that were coded, or of all where none of these is near.
+    # The nearest of the coded frames, or of all where no coded one is near.
     coded = [one for one in frames if one.base is not None and distance_ns(one) <= _UNCODED_NS]
     return min(coded or frames, key=distance_ns)
 
 
 def _reach_ns(frames: Sequence[RingFrame]) -> int:
-    # Half a gap before the oldest: what was requested lies nearer to it than to one that is gone.
+    # Half a gap before the oldest: a time requested after that lies nearer to it than to a frame already dropped.
     first = frames[0].capture_ns
     gap_ns = frames[1].capture_ns - first if len(frames) > 1 else 0
     return first - gap_ns // 2

@@ -4,7 +4,7 @@ Both cost bits that the video could have.
 
 **Tracks** pay if the detector knows the view, and the ground's misses objects on the base, or finds false ones: their
 gain in F1 is the shadow ground's measurement, less the gain of video by the same bits. **Stills** pay if they change
-the ground's list: it reports the outcome of each. If hardly any changed anything they pause, and a few are sent now
+the ground's list: it reports the outcome of each. If hardly any changed the list they pause, and a few are sent now
 and then as a test. If the source is much finer than the base, they never pause, because they show details.
 
 False reports of a ground can stop stills and tracks or bring them back, and with them move some of the bits of the
@@ -27,23 +27,23 @@ class Measured:
     """The shadow ground's gains of tracks (see `hvt_edge.perception`); zero at first. Gains are of F1, 0…1."""
 
     comparisons: float = 0.0
-    """How many comparisons it comes of."""
+    """Weight of the comparisons behind the gains."""
     gain: float = 0.0
     """The gain of sending tracks."""
     sure_gain: float = 0.0
-    """The same where of few objects hardly any count."""
+    """The gain without one standard error of the changes: near zero where it rests on few objects."""
     hidden: float = 0.0
-    """Objects a picture that the base does not show."""
+    """Objects in a picture that the base does not show."""
     suppressed: float = 0.0
-    """Objects a picture that only the base shows, and that the ground lists without the edge's tracks."""
+    """Objects in a picture that only the base shows, and that the ground lists without the edge's tracks."""
     misnamed: float = 0.0
-    """Objects a picture that the base shows under another class."""
+    """Objects in a picture that the base shows under another class."""
     misnamed_share: float = 0.0
-    """Share of the shown objects that bear another class there."""
+    """Share of the shown objects that have another class there."""
     reported: bool = False
-    """The ground's own detector shows even fewer: ``hidden`` are those that it misses."""
+    """The ground's own detector shows even fewer objects: ``hidden`` are those that it misses."""
     moved: float = 0.0
-    """By so much the gain changed at the last comparison."""
+    """Change of the gain at the last comparison."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class LeverSettings:
     least_comparisons: float = 1.5
     """Comparisons before tracks are sent, because a single picture may be an exception, unless …"""
     plain_gain: float = 0.2
-    """… the net gain is as plain as this; so too where hardly any of it is sure, of the only object there is."""
+    """… the net gain reaches this; also where hardly any of it is sure, because there is only one object."""
     least_answers: int = 12
     """Answered stills before stills may pause."""
     most_answers: int = 40
@@ -67,7 +67,7 @@ class LeverSettings:
     least_changed: float = 0.1
     """The share of stills that must change something."""
     finer: bool = False
-    """The source is so much finer than the base that stills show something in any case: they never pause."""
+    """The source is so much finer than the base that stills always show more: they never pause."""
     pause_ns: int = 20 * SECOND_NS
     """How long stills pause before some are tried again; twice as long after each vain try, up to 8 times."""
     most_pauses: int = 8
@@ -81,7 +81,7 @@ class LeverSettings:
         """Whether to send tracks, by the measurements; ``sent``: they are being sent."""
         if measured.comparisons and self.net_gain(measured.gain, total_bps=total_bps) >= self.plain_gain:
             return True
-        # Of a ground that sees more than the edge found, what is sure may be more: else they would come and go.
+        # Where the ground sees more than the edge found, the sure gain may be larger: else tracks would come and go.
         gain = max(measured.gain, measured.sure_gain) if sent else measured.sure_gain
         enough = measured.comparisons >= self.least_comparisons
         return enough and self.net_gain(gain, total_bps=total_bps) >= self.least_gain
@@ -97,7 +97,7 @@ class LeverControl:
         self.measured = Measured()
         """The newest measurement of the shadow ground."""
         self.unlike = False
-        """The detector does not know the view, so that a gain in what it finds is a gain in guesses."""
+        """The detector does not know the view: any gain in its detections is a gain in guesses."""
         self._changed: deque[bool] = deque(maxlen=settings.most_answers)
         self._paused_until_ns: int | None = None
         self._pauses = 1
@@ -105,33 +105,33 @@ class LeverControl:
         operating.pull(Levers(tracks=False))
 
     def take_answer(self, *, changed: bool) -> None:
-        """A ground has inspected a still; ``changed``: by it alone the object is another than the edge says."""
+        """A ground has inspected a still; ``changed``: only by that still it names another object than the edge."""
         self._changed.append(changed)
 
     def take_load(self, *, too_slow: bool, now_ns: int) -> None:
-        """``too_slow``: the detector does not come to look. From any thread.
+        """``too_slow``: the detector does not run any more. From any thread.
 
-        It decides then too, because perception may never come to it.
+        It decides at once, because perception may never get to decide.
         """
         self._too_slow = too_slow
         if too_slow:
             self.decide(now_ns)
 
     def forget(self) -> None:
-        """Another scene: measurements of the last one say nothing of it."""
+        """The scene has changed: measurements of the last one say nothing of the new one."""
         self.measured = Measured()
         self._changed.clear()
         self._paused_until_ns, self._pauses = None, 1
 
     def decide(self, now_ns: int) -> Levers:
-        """Decide by the present measurements; ``now_ns`` is the time that windows go by."""
+        """Decide by the present measurements; ``now_ns`` is the time of the budget's windows."""
         with self._lock:
             return self._decide(now_ns)
 
     def _decide(self, now_ns: int) -> Levers:
         before = self._operating.now.levers
         tracks = self._tracks(before.tracks) and not self._too_slow
-        # Tracks tell classes too; without them a still is what corrects one.
+        # Tracks carry classes too; without tracks only a still can correct a class.
         named = tracks or self.measured.misnamed_share < self._settings.least_changed
         wanted = self._settings.finer or self._stills(now_ns) or not named
         stills = wanted and not self._too_slow
@@ -142,7 +142,7 @@ class LeverControl:
 
     @property
     def stable(self) -> bool:
-        """Whether tracks are judged the same were the gain twice as far from here as it moved last."""
+        """Whether the decision on tracks stays the same if the gain changes by twice its last change."""
         now, sent = self.measured, self._operating.now.levers.tracks
         margin = max(self._settings.least_gain, 2 * now.moved)
         near = (replace(now, gain=now.gain + by, sure_gain=now.sure_gain + by) for by in (-margin, margin))

@@ -1,8 +1,8 @@
 """The shadow ground: which of the source's objects the ground's detector would miss on the base stream.
 
 The edge decodes its own stream and holds the untouched source, so it can measure instead of guess. Now and then, on a
-frame whose source the detector has just seen, it runs the detector on the decoded base frame too, as the ground does,
-and compares object by object. What it takes for true is what the detector says of the source, each box by its
+frame whose source the detector has just searched, it runs the detector on the decoded base frame too, as the ground
+does, and compares object by object. The detections on the source are taken for true, each box by its
 confidence: with a calibrated detector a box of .6 is real three times in five. So a box that the base does not
 show counts as much for being sent as against it.
 
@@ -17,10 +17,10 @@ confidences p, those of base-only boxes after the source's missed detection, `Re
 
 ``hidden`` are the source boxes that the base does not show and the ground would list: from `EDGE_ONLY_CONFIDENCE` on.
 ``suppressed`` are the base-only boxes that the ground no longer lists once the edge's tracks miss them.
-``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
+``w`` is 1/3: of two names for one object the finer picture's name is right twice as often (our choice).
 
-The ground's detector may be another, or none. It reports how many objects it shows; where that differs from what was
-found on the base here, so many count as hidden, or as shown, instead (`Shadow.corrected`).
+The ground's detector may be another, or none. It reports how many objects it shows; where that differs from the count
+found on the base here, the difference counts as hidden, or as shown, instead (`Shadow.corrected`).
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ _LEAST_MORE = 0.5
 _BASE_NAMES = 1 / 3
 """How often the base's name is right if base and source name an object differently."""
 _REST_NS, _QUICK_REST_NS = SECOND_NS, SECOND_NS // 3
-"""Capture time from one comparison to the next, at least, twice as long while `ShadowGround.stable`; at first they
-are made in quick order, …"""
+"""Least capture time from one comparison to the next, twice as long while `ShadowGround.stable`; the shorter time
+applies to the first comparisons, …"""
 _QUICK_COMPARISONS = 2.5
-"""… so few, because nothing is known."""
+"""… up to this weight, because nothing is known yet."""
 _MEMORY_S = 8.0
-"""Time constant with which former comparisons fade."""
+"""Time constant with which earlier comparisons fade."""
 _SAME_SHARE = 0.75
-"""Of the tracks at the comparison before and now: with fewer of the same it is another view."""
+"""Share of tracks in common with the comparison before: with fewer it is another view."""
 _MATCH_IOU = 0.3
 """The ground's own limit for one object: boxes of 15 pixels from two pictures seldom overlap more."""
 
@@ -70,7 +70,7 @@ class Detected:
     frame_index: int
     """The last frame that it was done with."""
     objects: int
-    """How many it showed when it last looked, by that frame."""
+    """Number of objects that it showed at its last detection up to that frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +81,9 @@ class _Comparison:
 
 
 class GroundDifference:
-    """Objects more at the ground than here, in the mean, the newest counting most. Deterministic; not thread-safe.
+    """Mean surplus of objects at the ground over the edge, the newest counting most. Deterministic; not thread-safe.
 
-    Compared are counts of about the same frame, so that a scene which fills or empties is no difference.
+    The counts are of about the same frame, so that a scene which fills or empties makes no difference.
     """
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ class GroundDifference:
         self.forget()
 
     def forget(self) -> None:
-        """Another scene: reports of the one before say nothing of it."""
+        """The scene has changed: reports of the one before say nothing of it."""
         self._open: deque[_Comparison] = deque(maxlen=_MOST_OPEN)
         self._mean, self._worth = 0.0, 0.0
         self._worth_ns: int | None = None
@@ -99,16 +99,16 @@ class GroundDifference:
 
     @property
     def mean(self) -> float | None:
-        """Less than 0 where the ground shows fewer; None where it has not said, or not for a while."""
+        """The mean; below 0 where the ground shows fewer. None where it has not reported, or not for a while."""
         return self._mean if self._worth >= _LEAST_WORTH else None
 
     def expect(self, frame_index: int, objects: float, *, capture_ns: int) -> None:
-        """Note the number found here on the base picture of this frame."""
+        """Note the number of objects found here on the base picture of this frame."""
         self._fade(capture_ns)
         self._open.append(_Comparison(frame_index, capture_ns, objects))
 
     def take(self, report: Detected) -> None:
-        """Compare a report with the number found here on the newest picture that it covers."""
+        """Compare a report with the number found here on the newest frame that it covers."""
         if report.receiver_id != self._receiver_id:  # another model, perhaps
             self._receiver_id = report.receiver_id
             self._mean, self._worth, self._first_ns = 0.0, 0.0, None
@@ -132,26 +132,26 @@ class GroundDifference:
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """The measured gains, means a picture, the newest most; see the module for ``p``."""
+    """The measured gains as means per picture, the newest counting most; see the module for ``p``."""
 
     comparisons: float = 0.0
-    """How many comparisons the means are worth."""
+    """Weight of the comparisons behind the means."""
     source_p: float = 0.0
     """Sum of the confidences of all boxes of the source."""
     shown: float = 0.0
-    """Those of them that the base shows too."""
+    """Source boxes that the base shows too."""
     shown_p: float = 0.0
     hidden: float = 0.0
-    """Those that the base does not show and the ground would list."""
+    """Source boxes that the base does not show and the ground would list."""
     hidden_p: float = 0.0
     misnamed: float = 0.0
-    """Shown objects that bear another class on the base."""
+    """Shown objects that have another class on the base."""
     misnamed_p: float = 0.0
     false: float = 0.0
     """Boxes of the base where the source has none."""
     false_p: float = 0.0
     suppressed: float = 0.0
-    """Those of them that the ground would not list if it were sent tracks."""
+    """False boxes that the ground would not list if it were sent tracks."""
     suppressed_p: float = 0.0
 
     @property
@@ -165,23 +165,23 @@ class Shadow:
 
     @property
     def sure_gain(self) -> float:
-        """The same where of all that tracks change one standard error counts for nothing (Poisson).
+        """The same without one standard error of the tracks' changes (Poisson).
 
-        Pictures of one second show the same objects, and of two or three the detector may just be wrong.
+        Pictures of one second show the same objects, and on two or three of them the detector may just be wrong.
         """
         changed = self.hidden + self.misnamed + self.suppressed
         return self._gain(1 - 1 / math.sqrt(changed)) if changed > 1 else 0.0
 
     def corrected(self, more: float, *, sure: bool) -> Shadow:
-        """The same for a ground whose own detector shows ``more`` objects than were found here; less than 0: fewer.
+        """The same for a ground whose own detector shows ``more`` objects than were found here; below 0: fewer.
 
-        With ``sure`` one standard error of the count counts for nothing (Poisson). Half an object is none. Which
-        objects they are nobody says: each is taken to be as sure as the others of its kind here.
+        With ``sure`` one standard error of the count is subtracted (Poisson). Less than half an object counts as
+        none. The report names no objects: each is taken to be as sure as the others of its kind here.
         """
         found = self.shown + self.false
         error = math.sqrt(max(found, found + more)) if sure else 0.0
         moved = math.copysign(max(0.0, abs(more) - error), more) if abs(more) >= _LEAST_MORE else 0.0
-        # Fewer: of each kind that is shown here the same share.
+        # With fewer objects each kind that is shown here loses the same share.
         left = 1 + max(-1.0, min(0.0, moved) / found) if found else 1.0
         moved = min(self.hidden, moved) if moved > 0 else (left - 1) * self.shown
         moved_p = moved * (_per(self.hidden_p, self.hidden) if moved > 0 else _per(self.shown_p, self.shown))
@@ -232,11 +232,11 @@ UNMEASURED = Shadow()
 
 
 class ShadowGround:
-    """Looks now and then, where ``cpu_budget`` admits it.
+    """Compares source and base now and then, if ``cpu_budget`` admits it.
 
-    ``detect`` is the detector on a whole picture, as the ground runs it; None of it while it does not work. From
-    ``confidence`` on a detection starts a track, at the edge and at the ground.
-    It goes on from what was measured of the scene ``before``.
+    ``detect`` runs the detector on a whole picture, as the ground does; it returns None while it does not work. A
+    detection of at least ``confidence`` starts a track, at the edge and at the ground.
+    It continues from the measurements of the scene ``before``.
     """
 
     def __init__(
@@ -255,16 +255,16 @@ class ShadowGround:
         self._shown_ids = np.empty(0, np.int64)
         """Tracks that the base showed at the comparison before."""
         self._compared_ids = self._shown_ids
-        """All tracks of then."""
+        """All tracks at that comparison."""
         self.stable = False
-        """Nothing would follow from another comparison soon, as its user says."""
+        """The caller says that another comparison soon would change no decision."""
         self.scene_began = -1
-        """The frame that this scene began with."""
+        """The frame with which this scene began."""
         self._moved = 0.0
         self._recall = Recall()
         """The share of the base's sure objects that the source shows too."""
         self.now = before
-        """For a ground with the edge's detector."""
+        """The measurement for a ground with the edge's detector."""
         self._difference = GroundDifference()
 
     @property
@@ -281,7 +281,7 @@ class ShadowGround:
         self._difference.take(report)
 
     def compare(self, seen: AnalyzedFrame) -> bool:
-        """Compare, if this is a decision step on a coded frame and one is due; tell whether it was done."""
+        """Compare, if this is a decision step on a coded frame and a comparison is due; tell whether it was done."""
         capture_ns = seen.frame.capture_ns
         if seen.scene_began > self.scene_began:
             self.scene_began = seen.scene_began
@@ -292,7 +292,7 @@ class ShadowGround:
             return False
         if not self._next_ns:  # the first picture of a stream is coarser than any other
             self._next_ns = capture_ns + _QUICK_REST_NS
-            self._last_ns = capture_ns  # what was measured before is no older
+            self._last_ns = capture_ns  # earlier measurements have not aged
             return False
         if not self._cpu_budget.admits_comparison(capture_ns):
             return False
@@ -326,7 +326,7 @@ class ShadowGround:
         tracks, least = seen.tracks, self._confidence
         rows = np.flatnonzero(tracks.seen_frames == tracks.frame_index)
         boxes, p = tracks.boxes_xyxy_px[rows], tracks.confidences[rows].astype(float)
-        # A track that has begun goes on with weak detections too, so that they show an object.
+        # A track once shown continues with weak detections too, so a weak one is enough to show the object.
         overlaps = iou(found.boxes_xyxy_px, boxes)
         same = overlaps >= _MATCH_IOU
         strong = found.confidences >= least
