@@ -1,13 +1,13 @@
-"""The still stage: crop of the untouched source frame, coded to fit its admission, and better than the base.
+"""The still stage: crop of the untouched source frame, coded to fit its allowance, and better than the base.
 
-Two promises hold for every still that leaves here: it is never larger than its admission, and, where the decoded
-base frame is at hand, it is closer to the source than what the base shows of the same place: in colour and in luma,
+Two promises hold for every still that leaves here: it is never larger than its allowance, and, where the decoded
+base frame is at hand, it is closer to the source than the base's picture of the same place: in colour and in luma,
 over the padded crop and over each box alone (mean squared error, hence PSNR). Where both promises cannot be kept
-there is no still, and the reason is said.
+no still is made, and the reason is returned.
 
 A codec that builds on the base (``residual``) is used where the decoded base of the same source frame is at hand. The
-fallback codec takes its place where there is none, and where the base is so far off that it comes out smaller for the
-same picture.
+fallback codec takes its place where there is none, and where the base is so far off that the fallback is smaller for
+the same quality.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from hvt_edge.perception.candidates import PADDING
 from hvt_edge.stills.policy.base import Request, union_crop
 
 Allowance = Callable[[Still], int]
-"""How many payload bytes a still with this header may take now; the header's own data does not count."""
+"""Returns the payload bytes that a still with this header may take now; the header's own data does not count."""
 
 _TRIES = 3
-"""Tries to fit payload and parameters into one admission: parameters hardly change in size."""
+"""Tries to fit payload and parameters into one allowance: parameters hardly change in size."""
 _QUALITY_STEP_PCT = 5
 _LEAST_PCT, _MOST_PCT = 1, 95
 _READ_BY_ALL = JpegCodec()
@@ -45,11 +45,11 @@ _READ_BY_ALL = JpegCodec()
 
 @dataclass(frozen=True, slots=True)
 class NoStill:
-    """Why no still was made."""
+    """The reason why no still was made."""
 
     reason: Literal["too_large", "base_good"]
-    """``too_large``: nothing that is better than the base fits the admission (a larger one may help);
-    ``base_good``: the base shows it as well as the best quality would, or as well as is requested for."""
+    """``too_large``: no still that is better than the base fits the allowance (a larger one may help);
+    ``base_good``: the base shows it as well as the best quality would, or as well as the request demands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,22 +67,22 @@ class StillMaker:
 
     codec: StillCodec = field(default_factory=JpegCodec)
     fallback: StillCodec | None = None
-    """Needs no base; must be given where ``codec`` needs one, and is not used where it does not."""
+    """The codec that needs no base; required if ``codec`` needs one, and otherwise not used."""
     quality_pct: int = 65
-    """Requested; less where the admission is smaller, more where the base is already better."""
+    """Requested quality; lower where the allowance is smaller, higher where the base is already better."""
     fidelity_db: float = 0.0
     """Luma PSNR to reach with the fewest bytes, in place of ``quality_pct``; 0: the quality is fixed."""
     floor_pct: int = 35
-    """Never below it: what is worse than that tells a classifier little. A codec that builds on the base has no
+    """Lowest quality: a worse still tells a classifier little. A codec that builds on the base has no
     floor, because the base stays."""
     ceiling_pct: int = 90
-    """The most that is spent on being better than the base."""
+    """Highest quality that may be spent on being better than the base."""
     min_gain_db: float = 0.1
-    """The still must be closer than the base by this; it covers the rounding of others."""
+    """Least gain over the base; it covers the rounding errors of other decoders."""
     least_bytes: int = 0
     """A smaller still is mostly header and changes nothing at the ground: it gets more bytes, or waits for them."""
     readable: Callable[[str], bool] = lambda _codec: True
-    """Whether every ground that listens reads stills of this codec; ``jpeg`` takes the place of any other."""
+    """Whether every ground that listens decodes this codec; ``jpeg`` takes the place of any other."""
     padding: float = PADDING
     max_side_px: int = MAX_SIDE_PX
 
@@ -99,7 +99,7 @@ class StillMaker:
 
     @property
     def without_base(self) -> StillCodec:
-        """The codec of stills that show the same whatever base frames the ground has."""
+        """The codec of stills that look the same whatever base frames the ground has."""
         codec = self.fallback if self.codec.needs_base else self.codec
         assert codec is not None, "checked at the start"
         return codec if self.readable(codec.name) else _READ_BY_ALL
@@ -111,7 +111,7 @@ class StillMaker:
     def crop(
         self, frame: Frame, request: Request, *, view: View, base: Picture | None = None
     ) -> Still | NoStill:
-        """Take the request's crop out of ``frame``, which is the frame the request was made at.
+        """Crop the request out of ``frame``, which is the frame at which the request was made.
 
         ``base`` is the decoded base frame of the same index; without it the second promise is not checked.
         """
@@ -145,7 +145,7 @@ class StillMaker:
         return NoStill("base_good") if good else job
 
     def code(self, job: Still, *, sequence: int, allowance: Allowance) -> Still | NoStill:
-        """Code a crop so that ``allowance``, called with the very still that comes out, holds its data."""
+        """Code a crop within ``allowance``, which is called with the still as it comes out."""
         job, codec = job.with_header(sequence=sequence), self.preferred
         builds = job.base_crop_bgr is not None and codec.needs_base
         made = self._fitted(codec if builds else self.without_base, job, allowance)
@@ -170,7 +170,7 @@ class StillMaker:
         return NoStill("too_large")
 
     def _cheaper(self, built: Still, fitted: _Fitted, job: Still) -> Still | None:
-        # The fallback's still, where it shows no less than the one built on the base, in fewer bytes.
+        # The fallback's still, if it has the quality of the still built on the base in fewer bytes.
         codec = self.without_base
         smaller = _reaching(codec, job, psnr_y_db(fitted.shown_bgr, job.crop_bgr))
         if smaller is None or len(smaller.data) >= len(built.data) or not _beats_base(smaller, job):

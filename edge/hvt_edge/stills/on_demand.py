@@ -1,9 +1,9 @@
 """Stills that a ground requests: cropped at once from the frames of the last seconds, sent before all others.
 
 A request only crops (`OnDemand.request`, in the link's callback). Coding and sending have a thread of their own
-(`hvt_edge.stills.worker`), so that no detection stands before them, within the budget as every other still.
-`code_requested` says how: at the source's pixels, and better than the base. For its bytes frames of the video are
-left out (`hvt_edge.link.budget`), whatever share of the budget stills have. While one is pending, no other is sent.
+(`hvt_edge.stills.worker`), so that no detection delays them, within the budget as for every other still.
+`code_requested` codes them: at the source's pixels, and better than the base. Video frames are left out for their
+bytes (`hvt_edge.link.budget`), whatever share of the budget stills have. While one is pending, no other is sent.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from hvt_edge.stills.policy.base import CostModel
 from hvt_edge.stills.requested_coding import Capacity, RefusedError, code_requested
 
 ON_DEMAND = "asked"
-"""The reason that such a still carries on the wire and in the ledger."""
+"""The reason of a requested still on the wire and in the ledger."""
 
 
 @dataclass(frozen=True, slots=True)
 class OnDemandRequest:
-    """A track or a box, or neither for the whole frame; at a frame or so long ago, or neither for the newest."""
+    """A track or a box, or neither for the whole frame; at a frame or ``ago_ms``, or neither for the newest."""
 
     track_id: int | None = None
-    """The edge's."""
+    """The edge's track id."""
     box_xywh_px: tuple[int, int, int, int] | None = None
     """Left, top, width and height in source pixels."""
     frame_index: int | None = None
     ago_ms: int | None = None
-    """Before the newest frame."""
+    """Time before the newest frame."""
     quality_pct: int | None = None
     """None for the quality of all stills."""
 
 
 def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
-    """The frame that is requested, or the nearest in the ring; raises `RefusedError` where it is gone or to come.
+    """The requested frame, or the nearest in the ring; raises `RefusedError` where it is gone or yet to come.
 
-    The newest means the newest that was coded, unless the track is not in it. A track is in frames that were analyzed
-    alone; anything else may be requested of the newest from the camera too.
+    The newest means the newest coded frame, unless the track is not in it. Only analyzed frames have tracks; a
+    request without a track may also get the camera's newest frame.
     """
     tracked = request.track_id is not None
     newest, newest_held = ring.newest(tracked=False), ring.newest(tracked=tracked)
@@ -84,7 +84,7 @@ def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
 def crop_for(
     request: OnDemandRequest, frame: RingFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]
 ) -> Still:
-    """Crop what is requested out of that frame; raises `RefusedError` where it is not in it."""
+    """Crop the requested region out of that frame; raises `RefusedError` where it is not in it."""
     width, height = frame.size
     box: Box
     if request.track_id is not None:
@@ -147,17 +147,17 @@ def box_of(boxes: Boxes, row: int) -> Box:
 
 
 REQUEST_PARAMETER = "ask"
-"""The parameter that carries its number."""
+"""The parameter that carries the request's number."""
 
 _PROMPT_SHARE = 0.6
-"""Of the most that the video yields: what comes within a second or so where the link is as thin as the budget."""
+"""Share of the video's rate for an on-demand still: on a link as thin as the budget it takes about a second."""
 _MARGIN_BYTES = 64
-"""By which a header may be longer than is estimated."""
+"""Bytes by which a header may be longer than its estimate."""
 _MAX_PENDING = 4
 _AGAIN_NS = 2 * SECOND_NS
-"""For so long a ground waits for an answer, and asks again meanwhile."""
+"""Time for which a ground waits for an answer, and repeats its request meanwhile."""
 _TRACKED_NS = 30_000_000_000
-"""For so long after a request for tracks they are followed, where nothing else needs them."""
+"""Time after a request for tracks during which objects are tracked, even if nothing else needs them."""
 _OUTCOMES = 64
 _ENDED = "the edge has ended"
 _OFFLINE = "no ground receives the video of this edge: until one does, stills are stored"
@@ -165,22 +165,22 @@ _OFFLINE = "no ground receives the video of this edge: until one does, stills ar
 
 @dataclass(slots=True, eq=False)
 class OnDemandStill(OutboxStill):
-    """One that a ground requested."""
+    """A still that a ground requested."""
 
     number: int = -1
     base: YuvPicture | Image | None = None
-    """What the base shows of its frame; gone once it is coded."""
+    """The base picture of its frame; None once the still is coded."""
     ready: Still | None = None
-    """Coded, and not gone yet."""
+    """The coded still, until it is sent."""
     behind: bool = False
-    """Another was pending when it was requested."""
+    """Another still was pending when it was requested."""
     link_busy: bool = False
-    """The budget had room for it, and the link had not, when that was last tried."""
+    """At the last try the budget had room for it, and the link had not."""
     on_demand: OnDemandRequest = OnDemandRequest()
 
     def frame_if_again(self, request: OnDemandRequest, capture_ns: int) -> int | None:
-        """The index of its frame where a request, for a frame of that time, is this one once more."""
-        job = self.job  # which goes as it is sent, in another thread
+        """The index of its frame if a request, for a frame of that time, repeats the request of this still."""
+        job = self.job  # another thread clears it on sending
         if request != self.on_demand or self.state is not StillState.PENDING or job is None:
             return None
         near = abs(capture_ns - job.header.capture_ns) <= _AGAIN_NS
@@ -202,21 +202,21 @@ class OnDemand:
     class_names: tuple[str, ...]
     line: Transmitter
     offline: Callable[[], bool] = lambda: False
-    """Whether stills are stored, and none goes out."""
+    """Whether stills are stored instead of sent."""
 
     def __post_init__(self) -> None:
         self._maker = replace(
             self.maker, fidelity_db=0.0
-        )  # of crops without a base: never one that builds on it
+        )  # crops of frames without a base: never a codec that builds on it
         self._lock = threading.Lock()
         self._outcomes: Newest[int, tuple[str, str]] = Newest(_OUTCOMES)
-        """Number → (why it was given up, what else is to be said of it), both empty at first; of the last ones."""
+        """Number → (reason of giving up, note for the requester), both empty at first; of the newest requests."""
         self._next_number = 0
         self._last: OnDemandStill | None = None
         self._tracks_requested_ns: int | None = None
-        """Capture time of the newest frame then."""
+        """Capture time of the newest frame at the last request for tracks."""
         self._tracked = True
-        """Objects were, in the newest frame."""
+        """Whether objects were tracked in the newest frame."""
         self._ended = False
 
     def add(self, analyzed: AnalyzedFrame) -> None:
@@ -228,7 +228,7 @@ class OnDemand:
     def request(self, request: OnDemandRequest) -> tuple[int, int]:
         """Crop a still; return its number and frame index. Raises `RefusedError` with the reason.
 
-        The same request once more, while its still is pending, is that one: its answer may have been lost.
+        A repeated request, while its still is pending, returns that still: the first answer may have been lost.
         """
         if self._ended:
             raise RefusedError(_ENDED)
@@ -263,7 +263,7 @@ class OnDemand:
         return number, frame.frame_index
 
     def outcome(self, number: int) -> str:
-        """Return what is to be said of that still before it comes; nothing where it comes as requested, or came.
+        """Return the note on that still before it comes; empty where it comes as requested, or has come.
 
         Raises `RefusedError` where it was given up, or is not known (any more).
         """
@@ -276,7 +276,7 @@ class OnDemand:
             return note
 
     def tracks(self) -> tuple[int, tuple[TrackNow, ...], int]:
-        """The newest frame's index, its tracks by id, of too many the most confident, and how many there are."""
+        """The newest frame's index, its tracks by id (the most confident of too many), and the number of tracks."""
         newest = self.ring.newest()
         if newest is None:
             raise RefusedError("no frame was looked at yet, or none is kept (--ring)")
@@ -304,7 +304,7 @@ class OnDemand:
     # In the thread of requested stills
 
     def code(self, pending: OnDemandStill, *, now_ns: int, sequence: int, paced: bool) -> Still | None:
-        """The coded still, where it may go now. None: it waits, or was given up, and is no longer in the outbox.
+        """The coded still, if it may go now. None: it waits, or was given up, and is no longer in the outbox.
 
         ``paced``: it goes to the link, which has to be free.
         """
@@ -324,7 +324,7 @@ class OnDemand:
         return None
 
     def _code_anew(self, pending: OnDemandStill, most_bytes: int, *, now_ns: int) -> bool:
-        # Code it for what may be carried; False where there is none, and its requester is told why.
+        # Code it for the present limits; False where no still results, and its requester is given the reason.
         codec, job = self._maker.without_base, pending.crop
         height, width = job.crop_bgr.shape[:2]
         expected = CostModel.of_codec(codec.name).estimate().of_px(width * height)
@@ -341,7 +341,7 @@ class OnDemand:
         )
         try:
             pending.ready, note = code_requested(job, codec=codec, capacity=capacity)
-        except FOREIGN as error:  # somebody waits
+        except FOREIGN as error:  # a requester waits for an answer
             failed = RefusedError(f"it could not be coded ({reason_of(error)})")
             refused = error if isinstance(error, RefusedError) else failed
             self._give_up(pending, str(refused), now_ns=now_ns)
@@ -374,7 +374,7 @@ class OnDemand:
         self._ended = True
 
     def _want_tracks(self, capture_ns: int) -> None:
-        # Tracks are wanted; raises `RefusedError` where there are none because nobody wanted them until now.
+        # Note that tracks are wanted; raises `RefusedError` if there are none yet because nobody wanted them.
         self._tracks_requested_ns = capture_ns
         if not self._tracked:
             raise RefusedError(

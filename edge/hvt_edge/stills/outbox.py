@@ -1,4 +1,4 @@
-"""One outbox holds each still through its whole life, from the crop that waits to the report that names it."""
+"""One outbox holds each still through its whole life, from the pending crop to the report that names it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hvt_edge.link.stills import Still
 from hvt_edge.stills.policy.base import Request
 
 AGAIN = "again"
-"""The reason of a still whose crop was sent before, and the parameter that names the sequence of the first."""
+"""The reason of a still whose crop was sent before, and the parameter that names the first still's sequence."""
 _MIB = 2**20
 
 
@@ -31,7 +31,7 @@ class StillState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class OutboxSettings:
-    """Bounds, and when a still is overdue."""
+    """Bounds, and the times after which a still is overdue."""
 
     max_pending: int = 8
     """Limit for the method; requested stills have their own bound."""
@@ -44,7 +44,7 @@ class OutboxSettings:
     max_sent_ns: int = 4 * SECOND_NS
     least_wait_ns: int = SECOND_NS
     wait_round_trips: int = 3
-    """A still is overdue after so many round trips, and after ``least_wait_ns`` at the earliest."""
+    """A still is overdue after this many round trips, and after ``least_wait_ns`` at the earliest."""
 
 
 @dataclass(slots=True, eq=False)
@@ -52,13 +52,13 @@ class OutboxStill:
     """One still. Only the outbox changes its state."""
 
     job: Still | None
-    """The crop to be coded; of a sent still the crop to be coded again, None where that cannot be."""
+    """The crop to be coded; for a sent still the crop to be coded again, None where that is impossible."""
     request: Request | None
     """The method's request; None if a ground requested it."""
     utility: float
     """The method's score; infinite if a ground requested it."""
     since_ns: int | None
-    """The time since which it is pending; None until the sending thread has met it."""
+    """The time since which it is pending; None until the sending thread has seen it."""
     again: bool = False
     """The ground could not decode the first still of this crop."""
     state: StillState = StillState.PENDING
@@ -94,10 +94,10 @@ class Outbox:
     PENDING       a newer still of its track (`offer`)               EXPIRED, ``replaced``
     PENDING       too many pending, and this the least useful        EXPIRED, ``queue_full``
     PENDING       it waits too long (`expire`)                       EXPIRED, ``stale``
-    PENDING       no still comes of it, or the run ends              EXPIRED
+    PENDING       coding gives no still, or the run ends             EXPIRED
     PENDING       coded, the link carries it (`sent`)                SENT
     PENDING       coded, the link is away (`stored`)                 STORED
-    SENT          a report ought to have named it (`overdue`)        SENT, as a second copy (`sent_again`)
+    SENT          no report names it in time (`overdue`)             SENT, as a second copy (`sent_again`)
     SENT          a report names it (`on_report`)                    ACKNOWLEDGED
     SENT          the link goes away, or the run ends (`lose`)       LOST
     SENT          newer ones need its space                          EXPIRED
@@ -106,9 +106,9 @@ class Outbox:
     LOST          handed over without the base (`stored`)            STORED
     ============  =================================================  =======================================
 
-    Pending stills of the method are ordered by utility, at most one of each track; those that grounds request wait
+    Pending stills of the method are ordered by utility, at most one of each track; requested stills wait
     in a queue of their own, first come first served. ``reports``: whether reports count. In lockstep they do not,
-    because when they come must not decide what is sent.
+    because their arrival times must not decide which stills are sent.
     """
 
     def __init__(self, settings: OutboxSettings = OutboxSettings(), *, reports: bool = True) -> None:
@@ -116,9 +116,9 @@ class Outbox:
         self._reports = reports
         self._lock = threading.RLock()
         self.turn = threading.RLock()
-        """Held from when a still gets its number until it has gone out: two threads send, and numbers go up."""
+        """Held from a still's numbering until it is sent: two threads send, and numbers must rise."""
         self._pending: dict[int, OutboxStill] = {}
-        """The stills by the track that leads."""
+        """The stills by their leading track."""
         self._on_demand: deque[OutboxStill] = deque()
         self._sent: dict[int, OutboxStill] = {}
         """The stills by sequence, in the order of sending: not acknowledged, or with a crop to be coded again."""
@@ -145,7 +145,7 @@ class Outbox:
 
     @property
     def on_demand(self) -> OutboxStill | None:
-        """The first that a ground requested; None where none is pending."""
+        """The first requested still; None where none is pending."""
         with self._lock:
             return self._on_demand[0] if self._on_demand else None
 
@@ -155,11 +155,11 @@ class Outbox:
 
     @property
     def any_pending(self) -> bool:
-        """Whether a still waits for its allowance, one that a ground requested included."""
+        """Whether a still waits for its allowance, requested ones included."""
         return bool(self._pending or self._on_demand)
 
     def admits(self, request: Request, *, now_ns: int) -> bool:
-        """Whether a still of this request would stay if it were offered now."""
+        """Whether a still of this request would stay in the outbox if it were offered now."""
         with self._lock:
             if len(self._pending) < self.settings.max_pending or request.candidate.track_id in self._pending:
                 return True
@@ -167,10 +167,10 @@ class Outbox:
         return (request.score, -now_ns, -request.candidate.track_id) > least
 
     def offer(self, new: OutboxStill) -> list[tuple[OutboxStill, str]]:
-        """Take in a pending still; return those that had to leave for it, with the reason.
+        """Add a pending still; return the stills that had to leave for it, with the reason.
 
-        An older still leaves where the new one shows the track that leads it; a track that rides along in another's
-        still is taken off that one.
+        An older still leaves where the new one shows its leading track; a track that is only an extra in an older
+        still is removed from that one.
         """
         left: list[tuple[OutboxStill, str]] = []
         with self._lock:
@@ -185,7 +185,7 @@ class Outbox:
         return left
 
     def offer_on_demand(self, new: OutboxStill) -> None:
-        """Take in a still that a ground requested; who offers it bounds their number."""
+        """Add a requested still; the caller bounds their number."""
         with self._lock:
             self._on_demand.append(new)
 
@@ -200,7 +200,7 @@ class Outbox:
             return [self._expire(one, "stale") for one in old]
 
     def expire_on_demand(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
-        """The same of those that grounds requested."""
+        """Expire requested stills that have been pending for too long."""
         with self._lock:
             for one in self._on_demand:
                 one.since_ns = now_ns if one.since_ns is None else one.since_ns
@@ -213,18 +213,18 @@ class Outbox:
             self._expire(pending, "")
 
     def clear(self) -> list[tuple[OutboxStill, str]]:
-        """The run ends: give up all that is pending."""
+        """The run ends: give up all pending stills."""
         with self._lock:
             return [self._expire(one, "ended") for one in (*self._on_demand, *self.pending)]
 
     # Coded
 
     def sequence(self, *, store: bool) -> int:
-        """The number of the next still: for the link, or for the backlog; of one `turn`."""
+        """The number of the next still: for the link, or for the backlog; valid within one `turn`."""
         return self._next_sequences[store]
 
     def sent(self, pending: OutboxStill, still: Still, *, now_ns: int, resend: Still | None = None) -> None:
-        """It goes out. ``resend`` is its crop as it would be coded for a ground that cannot decode the still."""
+        """Note that it is sent. ``resend`` is its crop, for a ground that cannot decode the still."""
         settings = self.settings
         with self._lock:
             self._leave_pending(pending)
@@ -249,7 +249,7 @@ class Outbox:
             one.state, one.coded, one.job = StillState.STORED, still, None
 
     def sent_again(self, sent: OutboxStill) -> None:
-        """A second copy of it goes out."""
+        """Note that a second copy of it is sent."""
         sent.copies += 1
 
     @property
@@ -271,7 +271,7 @@ class Outbox:
     def on_report(
         self, still_sequence: int, missing: Sequence[int], *, now_ns: int, round_trip_ns: int = 0
     ) -> bool:
-        """The primary receiver has all stills up to a sequence but those ``missing``; return whether that is news."""
+        """The primary receiver has all stills up to a sequence but those ``missing``; return whether any are new."""
         if not self._reports:
             return False
         with self._lock:
@@ -294,9 +294,9 @@ class Outbox:
                 self._undecodable.add(sequence)
 
     def offer_undecodable(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
-        """Let the crops of these be pending once more, each once, unless something newer of the track is.
+        """Make the crops of undecodable stills pending again, each once, unless a newer still of the track is.
 
-        Returns those that had to leave for them, as `offer` does.
+        Returns the stills that had to leave for them, as `offer` does.
         """
         left: list[tuple[OutboxStill, str]] = []
         with self._lock:
@@ -316,9 +316,9 @@ class Outbox:
         return left
 
     def overdue(self, now_ns: int) -> list[OutboxStill]:
-        """Those to be sent again, most useful first: each once, while it is young.
+        """Stills to be sent again, most useful first: each once, while it is young.
 
-        Only what a report could have named counts: where none comes, nothing is known of what has arrived.
+        A still is overdue only if a report could have named it: without reports no arrival is known.
         """
         settings = self.settings
         wait_ns = max(settings.least_wait_ns, settings.wait_round_trips * self._round_trip_ns)
@@ -333,7 +333,7 @@ class Outbox:
         return sorted(overdue, key=lambda one: -one.utility)
 
     def lose(self) -> list[OutboxStill]:
-        """The link is down: take stills that no report has named for lost; most useful first."""
+        """The link is down: declare stills that no report has named lost; most useful first."""
         with self._lock:
             lost = self._unnamed()
             for one in lost:
@@ -370,7 +370,7 @@ class Outbox:
 
 
 def _take_off(pending: OutboxStill, track_ids: set[int]) -> None:
-    # These tracks are named no more; the crop stays as it is.
+    # The still no longer names these tracks; the crop stays as it is.
     job, request = pending.crop, pending.request
     assert request is not None, "only stills of the method show several tracks"
     named = tuple(one for one in job.header.also if one.track_id not in track_ids)

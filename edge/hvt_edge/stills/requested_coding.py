@@ -1,9 +1,9 @@
 """Codes a requested crop: the source's own pixels, better than the base's, in one message.
 
-Quality goes before size. The crop is coded at the quality that is requested, or better until it plainly shows more
-than the base. Where that is larger than what comes promptly, quality is lowered, as long as the still beats the base;
+Quality goes before size. The crop is coded at the requested quality, or better until it plainly shows more
+than the base. Where that is too large to arrive promptly, quality is lowered, as long as the still beats the base;
 then it may take all that a window yields; then it is shrunk, if that too is closer to the source. A still that is
-no closer than the base is no closer look: there is none, and the reason is a sentence.
+no closer than the base shows nothing new: it is refused, with a sentence that gives the reason.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from hvt_common.video.still_codecs import CodedCrop, StillCodec, best_fitting
 from hvt_edge.link.stills import Still, size_parameters
 
 _PLAIN_GAIN_DB = 2.0
-"""A still that is closer to the source than the base by so much shows plainly more."""
+"""A still that is closer to the source than the base by this much shows plainly more."""
 _LEAST_GAIN_DB = 0.3
-"""With less it shows nothing more."""
+"""A still with less gain shows nothing more."""
 
 
 class RefusedError(Exception):
-    """A request cannot be served; the text is one plain sentence for whoever requested it."""
+    """A request cannot be served; the text is one plain sentence for its requester."""
 
 
 _BEST_PCT = 95
@@ -35,7 +35,7 @@ _STEP_PCT = 10
 _FLOOR_PCT = 20
 """Below it a smaller picture of better quality shows more."""
 _FILLED = 0.85
-"""What takes such a share of its limit is searched for no longer: a large picture is coded in half the time."""
+"""The search ends with a still that fills this share of its limit: a large picture is coded in half the time."""
 _SHRINKS = (0.7, 0.5, 0.35, 0.25)
 _LEAST_SIDE = 8
 
@@ -45,13 +45,13 @@ class Capacity:
     """The payload limits of one message."""
 
     prompt_bytes: int
-    """The bytes that go out within a second."""
+    """The bytes that leave within a second."""
     most_bytes: int
-    """All that the video yields."""
+    """All bytes that the video yields."""
     total_bps: int
 
     def wait_s(self, size_bytes: int) -> float:
-        """About how long so many bytes take: to get free in the second that is past, and on a link of that rate."""
+        """About how long ``size_bytes`` take: to get free in the past second, and on a link of that rate."""
         return 1 + 8 * size_bytes / self.total_bps
 
 
@@ -67,7 +67,7 @@ class _Tried:
 
 
 def code_requested(job: Still, *, codec: StillCodec, capacity: Capacity) -> tuple[Still, str]:
-    """Code the crop of ``job`` at its quality; ``alternative`` is the base's crop, None if that is not known.
+    """Code the crop of ``job`` at its quality; its ``alternative`` is the base's crop, None if that is not known.
 
     Returns the still with a note for its requester, empty if it comes as requested; else raises `RefusedError`.
     """
@@ -105,7 +105,7 @@ class _Tries:
         return _Tried(self.done[quality_pct], quality_pct, (pixels.shape[1], pixels.shape[0]))
 
     def gain_db(self, one: _Tried) -> float:
-        """The gain in closeness to the source over the base, at the crop's own size."""
+        """The still's gain over the base in closeness to the source, at the crop's own size."""
         alternative, crop = self.job.alternative, self.job.crop_bgr
         if alternative is None:
             return math.inf
@@ -122,7 +122,7 @@ class _Tries:
         return one is not None and self.gain_db(one) >= _LEAST_GAIN_DB
 
     def fitting(self, limit_bytes: int, *, most_pct: int) -> _Tried | None:
-        """The best quality up to ``most_pct`` that fits, or nearly that."""
+        """The best quality up to ``most_pct`` that fits, or nearly the best."""
         found = best_fitting(
             self.codec,
             self._coded_bgr,
@@ -207,7 +207,7 @@ def _refusal(tries: _Tries, wanted: _Tried, capacity: Capacity) -> str:
     (width, height), shrink = wanted.size, 0.9 * math.sqrt(capacity.most_bytes / least.size_bytes)
     smaller = int(width * shrink), int(height * shrink)
     advice = f"ask for a smaller region, {smaller[0]}x{smaller[1]} or so"
-    if min(smaller) < _LEAST_SIDE:  # a camera's own video is never left out, and may take all
+    if min(smaller) < _LEAST_SIDE:  # a camera's own video is never left out, and may take the whole budget
         advice = "raise the budget"
     return (
         f"{width}x{height} pixels take {_kb(least.size_bytes)} to show more than the video does, and "

@@ -1,7 +1,7 @@
 """From tracks to stills: suppression, gate, method, merging, crop; then, as the budget allows, coding.
 
 Pure but for the pixels it codes: no threads, no clock, no network. The outcome of every pending still is counted; a
-candidate that rides along in the still of a neighbour shares that one's.
+candidate in the still of a neighbour shares that still's outcome.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from hvt_edge.stills.policy.base import CostModel, Method, Request, Step, expect
 
 @dataclass(frozen=True, slots=True)
 class Suppression:
-    """Holds back candidates before every method, so that methods differ in what they request and in nothing else.
+    """Holds back candidates before every method, so that methods differ only in their requests.
 
-    Frozen, without state: all it needs is in the candidates. The paper's plain variants run without it
+    Frozen, without state: all its inputs are in the candidates. The paper's plain variants run without it
     (``--cooldown 0``).
     """
 
     cooldown_s: float = 2.0
-    """A track that was sent rests this long; 0 is no rest."""
+    """Rest of a track after a still; 0 is no rest."""
     min_gain: float = 1.2
-    """Beyond the rest, it must have grown or sharpened by this factor since; 1 demands nothing."""
+    """After the rest, it must have grown or sharpened by this factor since the still; 1 demands nothing."""
     gain_s: float = 10.0
     """After this long without a still, it needs no gain any more."""
     avoid_border: bool = True
     """Wait for the whole object where it is only partly in the picture."""
     border_s: float = 1.0
-    """The longest such wait for a track of which nothing was sent yet."""
+    """The longest such wait for a track without a still so far."""
     retry_s: float = 1.0
-    """A track that the still stage refused rests this long; on in the plain variants too, for it costs time only."""
+    """Rest of a track that the still stage refused; on in the plain variants too, for it costs time only."""
 
     @classmethod
     def for_cooldown(cls, cooldown_s: float, *, min_gain: float = 1.2) -> Suppression:
@@ -50,7 +50,7 @@ class Suppression:
     def apply(
         self, candidates: Sequence[Candidate], *, now_ns: int
     ) -> tuple[list[Candidate], list[tuple[Candidate, str]]]:
-        """Split into those that may go on and those held, each with ``refused cooldown border no_gain``."""
+        """Split into allowed and held candidates; each held one with ``refused cooldown border no_gain``."""
         allowed: list[Candidate] = []
         held: list[tuple[Candidate, str]] = []
         for candidate in candidates:
@@ -77,8 +77,8 @@ class Suppression:
     def _waits_at_border(self, candidate: Candidate) -> bool:
         if candidate.sent_count and not candidate.last_sent_at_border:
             return True  # the ground has it whole; a part adds nothing
-        # One that leaves will not get better. One that enters gets its time, and no more, so that an object that
-        # only ever touches the border is seen once all the same.
+        # A leaving object will not get better. An entering one gets its time, and no more, so that an object that
+        # only ever touches the border gets a still all the same.
         return not candidate.leaving and candidate.border_s < self.border_s
 
     def _gained(self, candidate: Candidate) -> bool:
@@ -97,15 +97,15 @@ class Suppression:
 class Gate:
     """Refuses a still where the base shows enough; refuses nothing at 0 dB. Frozen, without state.
 
-    The edge decodes its own stream and knows what the base lost of each candidate (`BaseLoss`). Both conditions have
-    to hold, because each has its blind spot: PSNR is high on a dark or smooth object whatever became of its edges,
+    The edge decodes its own stream and measures the base's loss of each candidate (`BaseLoss`). Both conditions have
+    to hold, because each has its blind spot: PSNR is high on a dark or smooth object however blurred its edges are,
     and lost detail is small on a coarse object that is plainly wrong in colour. docs/stills.md has the figures.
     """
 
     psnr_y_db: float = 0.0
     """Luma PSNR of the base crop from which on the base counts as good; 0: no gate."""
     most_detail_lost: float = 0.4
-    """Nor may the base have lost more than this share of the crop's detail (`BaseLoss.detail_lost`)."""
+    """Most detail that the base may have lost, as a share of the crop's detail (`BaseLoss.detail_lost`)."""
 
     @property
     def on(self) -> bool:
@@ -121,13 +121,13 @@ def _since_s(then_ns: int | None, now_ns: int) -> float:
 
 
 Coded = Generator[OutboxStill, None, None]
-"""Stills that are coded and may go. Closing it gives other threads their turn."""
+"""Stills that are coded and may go. Closing the generator gives other threads their turn."""
 
 _FULL_SHARE = 0.9
-"""With so much of the most a still can ever be given, it is no use to wait for more."""
+"""At this share of the most that a still can ever be given, it is no use to wait for more."""
 _PATIENCE_SHARE = 0.75
-"""After this share of the longest wait, the most useful still is coded to whatever the budget allows: one that never
-gets what it is expected to need must not hold up all others for ever."""
+"""After this share of the longest wait, the most useful still is coded to whatever the budget allows: a still that
+never gets its expected bytes must not hold up all others for ever."""
 
 
 @dataclass(eq=False)
@@ -136,11 +136,11 @@ class Chooser:
 
     ``on_outcome(outcome, reason)`` is called with ``deferred`` or ``dropped`` for every candidate that a step did not
     simply pass over, and whose still does not go to the link; ``observe(candidates, step)`` with all tracks of each
-    step, those that rest included. Stills that grounds request go before all others: `requested` may run in a thread
+    step, resting ones included. Requested stills go before all others: `requested` may run in a thread
     of its own, beside all else.
 
-    A still that is overdue is sent again, as it was, before pending ones that are less useful, and only where it is
-    allowed: it holds up nobody, because what it shows grows old.
+    A still that is overdue is sent again, unchanged, before less useful pending ones, and only if it is
+    allowed: it holds up no other still, because its content grows old.
     """
 
     method: Method
@@ -149,7 +149,7 @@ class Chooser:
     memory: TrackMemory
     fps: float
     most_bytes: int
-    """The largest admission that the budget can give from now on, payload."""
+    """The largest allowance that the budget can give from now on, payload."""
     gate: Gate = field(default_factory=Gate)
     share: bool = False
     """Neighbours share one still where that is cheaper."""
@@ -172,9 +172,9 @@ class Chooser:
     def consider(
         self, analyzed: AnalyzedFrame, *, now_ns: int, allowance_bytes: int, paused: bool = False
     ) -> None:
-        """Take in one frame's tracks; at a decision step let the method request stills, unless it is ``paused``.
+        """Process one frame's tracks; at a decision step let the method request stills, unless it is ``paused``.
 
-        Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
+        Where stills build on the base, a step on a frame without one is put off to the next frame that has one.
         """
         if self.method.video_only:
             return
@@ -211,7 +211,7 @@ class Chooser:
         for _, reason in held:
             self.on_outcome("deferred", reason)
         # The gate comes last because it reads pixels, and before the method, so that the places in the outbox go to
-        # those that gain from a still.
+        # candidates that gain from a still.
         return [one for one in allowed if not self._gated(one, now_ns=now_ns)]
 
     def _gated(self, candidate: Candidate, *, now_ns: int) -> bool:
@@ -243,18 +243,18 @@ class Chooser:
                 self.memory.record_refused(one.track_id, now_ns=now_ns)
             self.on_outcome("dropped", job.reason)
             return
-        # A pending still must not hold frames: what is measured on them is measured now.
+        # A pending still must not hold frames: measurements on them are made now.
         pending = OutboxStill(job, request.without_frame(), request.score, now_ns)
         self._count_left(self.outbox.offer(pending), now_ns=now_ns)
 
     # Which stills go now
 
     def expire_requested(self, now_ns: int) -> None:
-        """Give up those that grounds requested too long ago, whether or not any may go now."""
+        """Give up stills that grounds requested too long ago, whether or not any may go now."""
         self._count_left(self.outbox.expire_on_demand(now_ns), now_ns=now_ns)
 
     def requested(self, *, now_ns: int, store: bool = False) -> Coded:
-        """Yield coded stills that grounds requested, as `stills` does those of the method."""
+        """Yield coded stills that grounds requested, as `stills` does for the method."""
         while isinstance(pending := self.outbox.on_demand, OnDemandStill):
             sequence = self.outbox.sequence(store=store)
             still = self.on_demand.code(pending, now_ns=now_ns, sequence=sequence, paced=not store)
@@ -268,8 +268,8 @@ class Chooser:
     def stills(self, *, now_ns: int, allowance: Allowance, store: bool = False) -> Coded:
         """Yield coded stills of the method that fit ``allowance``; the caller sends each before it takes the next.
 
-        ``store``: they go to the backlog. Then none builds on the base, which may come later still, or never. None is
-        sent while a requested one waits for its allowance.
+        ``store``: they go to the backlog, and then none builds on the base, which may come later still, or never.
+        None is sent while a requested one waits for its allowance.
         """
         self._count_left(self.outbox.offer_undecodable(now_ns), now_ns=now_ns)
         self._count_left(self.outbox.expire(now_ns), now_ns=now_ns)
@@ -280,7 +280,7 @@ class Chooser:
                 job = job.without_base(self.maker.without_base)
             limit_bytes = allowance(job.with_header(sequence=self.outbox.sequence(store=store)))
             if not self._may_go(pending, job, limit_bytes, now_ns=now_ns):
-                break  # the most useful waits for its allowance; a lesser one does not slip in before it
+                break  # the most useful waits for its allowance; a lesser one must not go before it
             made = self._code(pending, job, now_ns=now_ns, allowance=allowance, store=store)
             if made is not None and self.outbox.on_demand is None:  # else one was requested meanwhile
                 with self.outbox.turn:
@@ -292,17 +292,17 @@ class Chooser:
         self._held_up = {track_id: ns for track_id, ns in self._held_up.items() if track_id in held}
 
     def _overdue(self, *, over: float, now_ns: int, allowance: Allowance) -> Iterator[OutboxStill]:
-        # Those to be sent again that are more useful than ``over``, and fit.
+        # Stills to be sent again that are more useful than ``over``, and fit.
         for sent in self.outbox.overdue(now_ns):
             if sent.utility <= over or self.outbox.on_demand is not None:
                 return
-            # Something newer of its track says more.
+            # A newer still of its track says more.
             if sent.track_id not in self.outbox and len(sent.still.data) <= allowance(sent.still):
                 self.outbox.sent_again(sent)
                 yield sent
 
     def _may_go(self, pending: OutboxStill, job: Still, limit_bytes: int, *, now_ns: int) -> bool:
-        # Whether it is allowed as much as it will need, or has waited for that long enough.
+        # Whether its allowance holds its expected bytes, or it has waited for that long enough.
         assert pending.request is not None, "it is of the method"
         if limit_bytes < self.maker.least_bytes:
             return False
@@ -340,7 +340,7 @@ class Chooser:
         resend = None
         if (
             not pending.again
-        ):  # else its tracks have rested since it was sent first, and it is not sent a third time
+        ):  # else its tracks have rested since the first sending, and it is not sent a third time
             for one in (pending.request.candidate, *pending.request.also):
                 self.memory.record_sent(one, frame_index=made.header.frame_index, now_ns=now_ns)
             if (
@@ -358,7 +358,7 @@ class Chooser:
         store: bool,
         resend: Still | None = None,
     ) -> None:
-        # It goes out, with the number that is next now: while it was coded another may have gone.
+        # It is sent under the number that is next now: another may have gone while it was coded.
         if still.header.sequence != (number := self.outbox.sequence(store=store)):
             still = still.with_header(sequence=number)
         if store:

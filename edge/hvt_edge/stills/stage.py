@@ -1,4 +1,4 @@
-"""A still's walk: tracks to the ground, a request of the method, a crop, coding, outbox, transmitter or backlog."""
+"""A still's path: tracks to the ground, a request of the method, a crop, coding, outbox, transmitter or backlog."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _ALL = Levers()
 class StillStage:
     """Takes each frame with its access unit, if it has one, after the unit was sent.
 
-    With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it. With ``levers``
-    both depend on what they were measured to give.
+    With a ``reporter`` the edge's own tracks are sent at each decision step, before its stills. With ``levers``
+    both depend on their measured gain.
     """
 
     analyzer: Analyzer
@@ -40,22 +40,22 @@ class StillStage:
     reporter: TrackReporter | None = None
     shadow: ShadowGround | None = None
     tracks_used: bool = True
-    """By the encoder, by whoever is sent them; else only a method that sends stills, or a ground's request, does."""
+    """Whether encoder or receivers use tracks; else only a method that sends stills, or a ground's request, does."""
     levers: LeverControl | None = None
-    """Decides by what ``shadow`` and the grounds say; None: tracks and stills are sent as the settings allow."""
+    """Decides by reports of ``shadow`` and the grounds; None: tracks and stills are sent as the settings allow."""
 
     def __post_init__(self) -> None:
         self.outbox = self.sender.outbox
         self.latest_tracks: Tracks | None = None
-        """Those of the frame that `step` took last. In lockstep they change at the same point of the frame loop in
-        every run, whatever `analyze` does meanwhile."""
+        """The tracks of the frame that `step` took last. In lockstep they change at the same point of the frame loop
+        in every run, whatever `analyze` does meanwhile."""
         self._levers = _ALL
         self._scene_began = -1
         self._detected: Detected | None = None
         """Reported since the decision before; in lockstep a frame may be compared at this very moment."""
 
     def capture(self, frame: Frame) -> None:
-        """The camera gave a frame, which may never be analyzed: a ground may ask for a still of it."""
+        """Hold the camera's newest frame, which may never be analyzed: a ground may request a still of it."""
         self.chooser.on_demand.ring.capture(frame)
 
     def analyze(
@@ -64,10 +64,10 @@ class StillStage:
         unit: AccessUnit | None,
         skipped: Sequence[AccessUnit] = (),
     ) -> AnalyzedFrame:
-        """Decode, detect and track one frame; ``unit`` is None for one that is not part of the base stream.
+        """Decode, detect and track one frame; ``unit`` is None for a frame that is not part of the base stream.
 
-        ``skipped`` are units before it, of frames that were not analyzed. Where nobody uses what would come of it,
-        nothing of this is done.
+        ``skipped`` are units before it, of frames that were not analyzed. Where nobody uses the results, the frame is
+        only decoded.
         """
         if not self.is_used(frame.capture_ns):
             return self.analyzer.pass_over(frame, unit, skipped=skipped)
@@ -77,12 +77,12 @@ class StillStage:
         return analyzed
 
     def is_used(self, capture_ns: int) -> bool:
-        """Whether anybody uses what `analyze` makes of a frame of that time."""
+        """Whether anybody uses the results of `analyze` for a frame of that time."""
         wanted = self.tracks_used or not self.chooser.method.video_only
         return wanted or self.chooser.on_demand.wants_tracks(capture_ns)
 
     def step(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
-        """Decide what is worth sending beside the video, tell grounds of the tracks, and `send` stills."""
+        """Decide on tracks and stills, send the tracks to grounds, and `send` stills."""
         self.latest_tracks = analyzed.tracks
         self.chooser.on_demand.add(analyzed)
         with self.analyzer.cpu_budget.spending("choose") if analyzed.detected else nullcontext():
@@ -94,12 +94,12 @@ class StillStage:
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills of the method that may go now; return their sequence numbers.
 
-        ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
-        asks the plan.
+        ``now_ns`` is the time of the budget's windows. With ``held`` none is sent, because a keyframe is due; None
+        takes that from the plan.
         """
         if most_bytes := self.sender.transmitter.most_still_bytes():
             self.chooser.most_bytes = most_bytes
-        # What a method requests waits until the link is free, which right behind a base frame it never is.
+        # A method's request waits until the link is free, which right behind a base frame it never is.
         allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
         self.chooser.consider(
             analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not self._levers.stills
@@ -107,7 +107,7 @@ class StillStage:
         return self.send_pending(now_ns=now_ns, held=held)
 
     def send_pending(self, *, now_ns: int, held: bool | None = None) -> set[int]:
-        """Send those of the method that are pending and may go now, without another frame; the rest as of `send`."""
+        """Send pending stills of the method that may go now, without another frame; arguments as for `send`."""
         self.sender.store_lost(now_ns)
         store = self.sender.offline
         if not store and (self.keyframes.due(now_ns) if held is None else held):
@@ -117,12 +117,12 @@ class StillStage:
         return self._put(stills, now_ns=now_ns, store=store)
 
     def send_requested(self, *, now_ns: int, held: bool | None = None) -> set[int]:
-        """Send those that grounds requested and may go now; the rest as of `send`. May run beside all else."""
+        """Send requested stills that may go now; arguments as for `send`. May run beside all else."""
         self.chooser.expire_requested(now_ns)
         store = self.sender.offline
         held = not store and (self.keyframes.due(now_ns) if held is None else held)
         if held and self.keyframes.requested:
-            return set()  # a keyframe of the schedule can wait for them, this one cannot
+            return set()  # a scheduled keyframe can wait for them, this one cannot
         stills = self.chooser.requested(now_ns=now_ns, store=store)
         return self._put(stills, now_ns=now_ns, store=store)
 
@@ -136,10 +136,10 @@ class StillStage:
         return sent
 
     def on_results(self, results: Sequence[StillResult], *, detected: Detected | None = None) -> None:
-        """Take a ground's answers to stills for the next decision; one without a name is no opinion.
+        """Note a ground's answers to stills for the next decision; one without a name is no opinion.
 
-        A still that it could not decode for want of the base frame is sent once more. ``detected`` is what its own
-        detector shows; None: it has said nothing new.
+        A still that it could not decode for want of the base frame is sent once more. ``detected`` is the report of
+        its own detector; None: there is nothing new.
         """
         if detected is not None:
             self._detected = detected
@@ -156,7 +156,7 @@ class StillStage:
                 )
 
     def note_load(self, cores: float, *, now_ns: int) -> None:
-        """Take how many cores the process takes; about once a second."""
+        """Note the cores that the process uses; about once a second."""
         cpu_budget = self.analyzer.cpu_budget
         cpu_budget.measure(cores, now_ns=now_ns)
         if self.levers is not None:
@@ -180,7 +180,7 @@ class StillStage:
         return levers
 
     def _note_change(self, result: StillResult) -> None:
-        # A still may change something where it alone shows the ground another object than the edge names.
+        # A still has changed something if by it alone the ground names another object than the edge.
         tracks = self.latest_tracks
         if self.levers is None or tracks is None:
             return
@@ -192,7 +192,7 @@ class StillStage:
 
 @dataclass(eq=False)
 class StillSender:
-    """`put` is for both threads of stills, the rest for that of the method's, or who ends the run after its end.
+    """`put` is for both threads of stills, the rest for the method's thread, or for the caller that ends the run.
 
     ``backlog`` may be None.
     """
@@ -219,12 +219,12 @@ class StillSender:
         if store:
             self._store(coded, now_ns=now_ns, counted=True)
             return
-        # A second copy waits for its allowance like any other: nobody waits for it.
+        # A second copy waits for its allowance like any other still, but no requester waits for it.
         copy, requested = AGAIN if coded.copies > 1 else "", coded.request is None and coded.copies == 1
         self.transmitter.still(coded.still, now_ns=now_ns, copy=copy, requested=requested)
 
     def store_lost(self, now_ns: int) -> None:
-        """Store stills that were sent before the link went, or came back, and that no report has named."""
+        """Store stills that were sent before the link went down, or came back, and that no report has named."""
         if self.backlog is None or self.backlog.breaks == self._breaks:
             return
         self._breaks = self.backlog.breaks
@@ -249,7 +249,7 @@ class StillSender:
         )
 
     def _without_base(self, still: Still, job: Still | None) -> Still:
-        # A sent still, coded anew without the base; itself where it is so, or its crop is gone.
+        # A sent still, coded anew without the base; unchanged where it needs none, or its crop is gone.
         if job is None:
             return still
         most_bytes = self.transmitter.most_still_bytes()

@@ -1,6 +1,6 @@
 """The threads of perception and stills in real time.
 
-Detection delays neither the base stream nor a still that somebody waits for.
+Detection delays neither the base stream nor a requested still.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 _PART, _REQUESTED_PART = "stills", "requested stills"
 _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 24 * 2**20
-"""Of frames that are queued: 9 of 1280x720 that are coded in that size, 2 of 1920x1080 and more."""
+"""Bytes of queued frames: 9 of 1280x720 that are coded in that size, 2 of 1920x1080 and more."""
 _RETRY_S = 0.025
 _FAILED_S = 1.0
 _MOST_SKIPPED_BYTES = 2 * 2**20
@@ -38,7 +38,7 @@ class SkippedUnits:
     def __init__(self) -> None:
         self._units: list[AccessUnit] = []
         self._whole = True
-        """Whether all since the last keyframe are there."""
+        """Whether all units since the last keyframe are there."""
 
     def add(self, unit: AccessUnit | None) -> None:
         """This frame is not analyzed; ``unit`` is None where it was not coded."""
@@ -55,9 +55,9 @@ class SkippedUnits:
         self._units, self._whole = [], False
 
     def take(self, unit: AccessUnit | None) -> tuple[AccessUnit | None, tuple[AccessUnit, ...]]:
-        """Return what the decoder may be given now: this frame's unit, and those before it.
+        """Return the units that the decoder may be given now: this frame's, and the earlier ones.
 
-        Where units are missing it is nothing until a keyframe: the frame is analyzed as one that was not coded.
+        Where units are missing it gets none until a keyframe: the frame is analyzed as one that was not coded.
         """
         if unit is None:
             return None, ()
@@ -69,13 +69,13 @@ class SkippedUnits:
 
 @dataclass(eq=False)
 class StillWorker:
-    """Runs a `StillStage` in a thread of its own, and the stills that grounds request in another.
+    """Runs a `StillStage` in a thread of its own, and requested stills in another.
 
-    The queue is bounded in frames and in bytes. Before each frame the thread takes what grounds have reported:
-    ``results()`` of stills, and what is ``detected()`` there. An error in it stops stills and perception
-    for a while, never the video: what is queued is given up, and the stage goes on from a keyframe.
+    The queue is bounded in frames and in bytes. Before each frame the thread takes the grounds' reports:
+    ``results()`` of stills, and detections by ``detected()``. An error in it stops stills and perception
+    for a while, never the video: queued frames are given up, and the stage goes on from a keyframe.
 
-    The other thread has no queue, and not the lower priority: it codes and sends what is requested while a detection,
+    The other thread has no queue, and not the lower priority: it codes and sends requested stills while a detection,
     a decision or an automatic still takes its time.
     """
 
@@ -110,7 +110,7 @@ class StillWorker:
 
     @property
     def full(self) -> bool:
-        """Whether the next frame finds no room, or the stage has failed a moment ago."""
+        """Whether the queue has no room for the next frame, or the stage has failed a moment ago."""
         return self._frames.qsize() >= self._most_frames or not self._pause.due(self.clock())
 
     def take(self, frame: Frame, unit: AccessUnit | None, *, late: bool = False) -> bool:
@@ -128,7 +128,7 @@ class StillWorker:
         return True
 
     def close(self) -> None:
-        """Let the threads finish what they have, at most for ``finish_s``, then leave the rest; join them."""
+        """Let the threads finish their queued work, at most for ``finish_s``, then give up the rest; join them."""
         until_s = time.monotonic() + self.finish_s
         with contextlib.suppress(queue.Full):
             self._frames.put(None, timeout=self.finish_s)
@@ -175,7 +175,7 @@ class StillWorker:
             with contextlib.suppress(queue.Empty):
                 while self._frames.get_nowait() is not None:
                     pass
-                self._given_up.set()  # what was taken away is the sign to end
+                self._given_up.set()  # the removed item was the end mark
         self.failures.failed(_PART, f"perception and stills stopped ({type(error).__name__}: {error})")
 
     def _next(self) -> tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None:

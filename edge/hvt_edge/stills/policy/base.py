@@ -3,9 +3,9 @@
 To add one: a frozen dataclass with its parameters in a file beside this one, and one row in `registry`.
 
 Small objects that stand close together share one still where that takes fewer bytes (`group`). A still costs its
-pixels and, whatever it shows, a fixed part: what the codec writes first, the header, framing and TCP. A crop around
+pixels and, whatever it shows, a fixed part: the codec's preamble, the header, framing and TCP. A crop around
 two neighbours codes the ground between them as well, and saves one fixed part. Whether that pays follows from the
-codec's own costs as they were learnt in this session.
+codec's own costs as learnt in this session.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MEMORY, _MEAN_MEMORY = 0.98, 0.95
 
 @dataclass(frozen=True, slots=True)
 class CostEstimate:
-    """The line, frozen at one moment."""
+    """The line of size over pixels, frozen at one moment."""
 
     fixed_bytes: float = _PRIOR_FIXED_BYTES
     bytes_per_px: float = _PRIOR_BYTES_PER_PX
@@ -53,14 +53,14 @@ class CostEstimate:
         return self.of_px(candidate.crop_area_px)
 
     def of_px(self, coded_px: float) -> float:
-        """Expected payload bytes of a still of so many coded pixels; never below 1."""
+        """Expected payload bytes of a still of ``coded_px`` pixels; never below 1."""
         return max(1.0, self.fixed_bytes + self.bytes_per_px * coded_px)
 
 
 class CostModel:
-    """The expected bytes of a still, from the bytes of those already sent.
+    """The expected bytes of a still, from the bytes of stills already sent.
 
-    A still's size is close to a line in its number of pixels: a header with its tables, then so much a pixel. On 413
+    A still's size is close to a line in its number of pixels: a header with its tables, then a cost per pixel. On 413
     crops of the drone_carpark clip JPEG at quality 65 costs 639 bytes plus 0.119 a pixel, which is where the estimate
     starts. Least squares with forgetting, each still weighted by its relative error, so that large ones do not rule.
 
@@ -76,14 +76,14 @@ class CostModel:
 
     @classmethod
     def of_codec(cls, name: str) -> CostModel:
-        """Starts where that codec is known to lie; one that is not known starts as JPEG."""
+        """Starts at the known costs of that codec; an unknown codec starts as JPEG."""
         if name not in _PRIORS:
             return cls()
         fixed, slope = _PRIORS[name]
         return cls(CostEstimate(fixed, slope, fixed + slope * _PRIOR_MEAN_PX))
 
     def observe(self, *, area_px: float, size_bytes: int) -> None:
-        """A still of that many coded pixels took that many payload bytes."""
+        """Add a still of ``area_px`` coded pixels that took ``size_bytes`` of payload."""
         self._sums = _MEMORY * self._sums + _weighted(area_px, float(size_bytes), 1.0)
         self._mean = _MEAN_MEMORY * self._mean + (1 - _MEAN_MEMORY) * size_bytes
 
@@ -115,7 +115,7 @@ class Step:
     base_size: tuple[int, int]
     """(width, height) in base pixels."""
     cost: CostEstimate
-    """The expected cost of a still, learnt from those already sent."""
+    """The expected cost of a still, learnt from stills already sent."""
     allowance_bytes: float
     """The bytes that the rolling budget would admit now."""
     still_overhead_bytes: float = STILL_OVERHEAD_BYTES
@@ -130,7 +130,7 @@ class Request:
 
     candidate: Candidate
     reason: str
-    """In a word or two, for the ledger, the wire and the viewer."""
+    """A word or two for the ledger, the wire and the viewer."""
     score: float
     """The queue sends the highest first; comparable within one method only."""
     also: tuple[Candidate, ...] = ()
@@ -148,12 +148,12 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """As ``--method`` and the tables say it."""
+        """The name in ``--method`` and in tables."""
         ...
 
     @property
     def video_only(self) -> bool:
-        """True where no still is ever wanted, so that the base stream may take the whole budget."""
+        """True if the method never requests a still, so that the base stream may take the whole budget."""
         return False
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
@@ -164,7 +164,7 @@ class Method(Protocol):
 def ranked(
     candidates: Iterable[Candidate], *, score: Callable[[Candidate], float | None], reason: str
 ) -> list[Request]:
-    """Requests for those with a score, highest first; ties go to the older track, whatever the order they came in."""
+    """Requests for candidates with a score, highest first; ties go to the older track, whatever the input order."""
     wanted = [
         Request(candidate, reason, value)
         for candidate in candidates
@@ -183,15 +183,15 @@ def group(
     most: int = MOST_ALSO,
     max_side_px: int = MAX_SIDE_PX,
 ) -> list[tuple[Request, list[Request]]]:
-    """Join the requests of one step into stills: each with its lead and the others that the same still shows.
+    """Join the requests of one step into stills: each with its lead and the other requests that it shows.
 
     The two stills that save most by becoming one are joined, and again, until no two save a byte; no still
     shows more than ``most`` tracks beside its lead, nor a side of more than ``max_side_px`` where it shows several.
-    ``overhead_bytes`` is what a still takes on the line beside its payload.
+    ``overhead_bytes`` are the line bytes of a still beside its payload.
 
-    The lead is the most useful of its group and comes with ``also`` filled and a score of its own: what all of them
-    gain over what the one still costs, if scores are gains per byte; never less than its score alone. Most wanted
-    first, ties by the lead's track id. Each request is in exactly one group.
+    The lead is the most useful request of its group and comes with ``also`` filled and a score of its own: the sum of
+    all gains over the cost of the joint still, if scores are gains per byte; never less than its score alone. Most
+    wanted first, ties by the lead's track id. Each request is in exactly one group.
     """
     compared = list(requests[:_MOST_COMPARED])
     crops = [
@@ -217,7 +217,7 @@ def group(
 def union_crop(
     request: Request, *, padding: float, source_size: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """The area of a still of it: the smallest box around the padded crops of all its tracks, source pixels."""
+    """The area of its still: the smallest box around the padded crops of all its tracks, source pixels."""
     crops = [
         crop_box(one.box_source_px, padding=padding, source_size=source_size)
         for one in (request.candidate, *request.also)
@@ -238,7 +238,7 @@ def expected_bytes(
 
 @dataclass(slots=True)
 class _Board:
-    # Stills under way: row ``i`` is the still that request ``i`` leads, until another takes it in.
+    # Stills in progress: row ``i`` is the still that request ``i`` leads, until another absorbs it.
 
     cost: CostEstimate
     overhead_bytes: float
@@ -250,7 +250,7 @@ class _Board:
     """(N,) expected line bytes."""
     single_bytes: npt.NDArray[np.float64]
     members: list[list[int]]
-    """Empty where another has taken the still in."""
+    """Empty where another still has absorbed this one."""
 
     def join(self) -> None:
         count = len(self.members)
@@ -273,7 +273,7 @@ class _Board:
         return [sorted(members) for members in self.members if members]
 
     def request(self, members: list[int], requests: Sequence[Request]) -> tuple[Request, list[Request]]:
-        """One still's request, and those that ride with it."""
+        """One still's request, and the other requests that it serves."""
         lead, others = requests[members[0]], [requests[index] for index in members[1:]]
         if not others:
             return lead, []
@@ -283,7 +283,7 @@ class _Board:
         return replace(lead, also=also, score=score), others
 
     def _savings(self, row: int) -> npt.NDArray[np.float64]:
-        # (N,) line bytes saved by joining this still with each other one; -inf where that may not be.
+        # (N,) line bytes saved by joining this still with each other one; -inf where that is not allowed.
         low = np.minimum(self.crops[:, :2], self.crops[row, :2])
         high = np.maximum(self.crops[:, 2:], self.crops[row, 2:])
         sides = high - low

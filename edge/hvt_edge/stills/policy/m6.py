@@ -1,12 +1,12 @@
 """M6: stills by expected gain per byte on the line.
 
     gain = P(the still helps) · [ (1 - k) · P(wrong before) + k · P(wrong after the last still) · better + detail ]
-    score = 1000 · gain / (expected payload + what a still takes beside it)
+    score = 1000 · gain / (expected payload + line bytes beside it)
 
-``gain`` is the chance that the class which the ground shows of a track becomes right by a still of it now, and ``k``
-fades with the time since the last still. ``detail`` is what a still shows beside the class, such as a code on a roof;
-it counts for nothing unless ``detail_weight`` says so. docs/methods.md says what the terms are and where their
-numbers come from.
+``gain`` is the chance that a still now makes the class right that the ground shows of a track, and ``k``
+fades with the time since the last still. ``detail`` is content beside the class, such as a code on a roof;
+it counts only with ``detail_weight`` above 0. docs/methods.md explains the terms and the sources of their
+numbers.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
 _SIDE_PX = 32.0
 """The size at which ``size_weight`` adds nothing."""
 _MOST_WEIGHT = 1000.0
-"""Beyond it classes count for nothing."""
+"""Limit of ``detail_weight``: beyond it classes count for nothing."""
 _MOST_LOGIT = 50.0
-"""Surer than that nothing is; keeps the exponential finite whatever weights a user tries."""
+"""Limit of certainty; keeps the exponential finite whatever weights a user tries."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedGain(Method):
     """Highest expected gain per byte first, from ``min_gain`` on, as many as ``lookahead`` times the allowance holds.
 
-    Requests beyond it are for neighbours that may share a still, and for the queue.
+    Requests beyond the allowance are for neighbours that may share a still, and for the queue.
     """
 
     bias: float = 0.5
     confidence_weight: float = 6.0
     lost_weight: float = 2.3
-    """Of the detail that the base has lost, for candidates detected on the decoded base."""
+    """Weight of the detail that the base has lost, for candidates detected on the decoded base."""
     lost_weight_source: float = 6.5
     """The same for candidates from the source, which the base may not show at all."""
     size_weight: float = 0.65
-    """For each doubling of the side, from 32 base pixels on; smaller objects count less."""
+    """Weight of each doubling of the side, from 32 base pixels on; smaller objects count less."""
     unknown_lost: float = 0.5
-    """Taken for the lost detail where no base picture was at hand."""
+    """Value of the lost detail where no base picture was at hand."""
     readable_px: float = 4.0
-    """Side in source pixels at which a perfect still is of use every second time."""
+    """Side in source pixels at which a perfect still helps every second time."""
     readable_confidence: float = 0.22
-    """Of a detection on the source: how surely a still would show it too; 1 - exp(-confidence / it)."""
+    """Scale of a source detection's confidence: a still shows the object with 1 - exp(-confidence / scale)."""
     sharp_half: float = 20.0
-    """Sharpness (variance of the Laplacian) at which it is half as useful."""
+    """Sharpness (variance of the Laplacian) at which a still is half as useful."""
     border_share: float = 0.2
     """The part of a still's use that a cut-off object loses."""
     covered_share: float = 0.3
@@ -62,20 +62,20 @@ class ExpectedGain(Method):
     unanswered: float = 0.3
     """P(wrong after the last still) while the ground has not answered."""
     disagreement: float = 0.35
-    """At least so much where ground and edge name different kinds."""
+    """Least P(wrong after the last still) where ground and edge name different kinds."""
     again: float = 0.1
-    """The use of another still of the same view, against the first."""
+    """The use of another still of the same view, relative to the first."""
     detail_weight: float = 0.0
     """The worth of a large object's details that the base does not show at all, in corrected classes."""
     detail_px: float = 48.0
     """Side in source pixels at which an object has half of the details that a large one has."""
     min_gain: float = 0.02
-    """Nothing below it is sent: about twice the rate at which a still spoils a class that was right."""
+    """Least gain of a still: about twice the rate at which a still spoils a class that was right."""
     lookahead: float = 3.0
     name: ClassVar[str] = "M6"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
-        """Best first; always at least the best one, so that it waits for its allowance."""
+        """Best first; always at least the best request, so that it waits for its allowance."""
         gains = {one.track_id: self.gain(one, step) for one in candidates}
         wanted = ranked(
             (one for one in candidates if gains[one.track_id] >= self.min_gain),
@@ -90,7 +90,7 @@ class ExpectedGain(Method):
         return wanted
 
     def gain(self, candidate: Candidate, step: Step) -> float:
-        """Chance that a still now sets the class right that the ground shows, 0…1, and the worth of its details."""
+        """Chance that a still now corrects the class that the ground shows, 0…1, plus the worth of its details."""
         faded = self._faded(candidate, now_ns=step.now_ns)
         before = faded * self.doubt(candidate, from_source=step.from_source)
         after = (1 - faded) * self._doubt_left(candidate) * self._better(candidate)
@@ -108,7 +108,7 @@ class ExpectedGain(Method):
         return self._lost(candidate) * area_px / (area_px + half * half)
 
     def doubt(self, candidate: Candidate, *, from_source: bool) -> float:
-        """P(wrong before any still): the ground misses the object on the base, or calls it something else."""
+        """P(wrong before any still): the ground misses the object on the base, or names another class."""
         weight = self.lost_weight_source if from_source else self.lost_weight
         lost = self._lost(candidate)
         x1, y1, x2, y2 = candidate.box_base_px
@@ -122,7 +122,7 @@ class ExpectedGain(Method):
         return 1 / (1 + math.exp(-min(_MOST_LOGIT, max(-_MOST_LOGIT, logit))))
 
     def use(self, candidate: Candidate, *, from_source: bool) -> float:
-        """P(the still helps): whether anything is to be read from the source crop."""
+        """P(the still helps): whether the source crop can be classified at all."""
         side_px = math.sqrt(max(1.0, candidate.area_px))
         use = side_px / (side_px + self.readable_px)
         if from_source and self.readable_confidence > 0:

@@ -1,7 +1,7 @@
 """The paper's methods M0 to M5, and R0, which every still has to beat. M6 is ours (`m6`).
 
 M5 is the paper's utility per cost, ``S = (0.5 U + 0.3 S_small + 0.2 N) / C``, with every term in 0…1. The paper gives
-weights and terms; how each is normalised is ours, and docs/methods.md says why.
+weights and terms; the normalisation of each is ours, and docs/methods.md explains it.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class Periodic(Method):
 
 @dataclass(frozen=True, slots=True)
 class OnStart(Method):
-    """M2: a still when a track begins, and when it is found again; those that wait longest come first."""
+    """M2: a still when a track begins, and when it is found again; the longest waiting come first."""
 
     patience_s: float = 1.0
-    """How long a start may wait for its still, be it for its allowance or to come away from the border."""
+    """How long a start may wait for its still, either for its allowance or to come away from the border."""
     name: ClassVar[str] = "M2"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
@@ -101,7 +101,7 @@ class Small(Method):
     """M4: area below a threshold, smallest first."""
 
     area_share: float = 0.015
-    """Of the base frame (the pilot's "small"): 118x118 pixels of 1280x720."""
+    """Share of the base frame (the pilot's "small"): 118x118 pixels of 1280x720."""
     name: ClassVar[str] = "M4"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
@@ -121,19 +121,19 @@ class Utility(Method):
     small_weight: float = 0.3
     novelty_weight: float = 0.2
     area_share: float = 0.015
-    """Where ``S_small`` reaches 0."""
+    """Share of the base frame at which ``S_small`` reaches 0."""
     novelty_s: float = 5.0
     """Time constant with which a track becomes new again after a still."""
     min_cost: float = 0.25
     """Least ``C``: keeps a wrong cost estimate from ruling the order."""
     min_score: float = 0.1
-    """Nothing below it is sent, whatever the budget allows."""
+    """Least score of a still, whatever the budget allows."""
     name: ClassVar[str] = "M5"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """As many of the best as the allowance holds, and always the best one, so that it waits for its allowance.
 
-        The threshold is thereby the score of the last that fits: the distribution it is taken from is this step's.
+        So the threshold is the score of the last request that fits, from the scores of this step alone.
         """
         scored = ranked(candidates, score=lambda one: self.score(one, step), reason="utility")
         wanted = [one for one in scored if one.score >= self.min_score]

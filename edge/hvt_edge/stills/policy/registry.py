@@ -55,7 +55,7 @@ METHODS: Mapping[str, MethodEntry] = MappingProxyType(
 
 
 def method(name: str, **parameters: float) -> Method:
-    """The method of that name (case does not matter), with parameters other than its defaults.
+    """The method of that name (case does not matter), with these parameters in place of its defaults.
 
     Raises `UserError` for an unknown name, an unknown parameter, or a value that is not a finite number from 0.
     """
@@ -74,7 +74,7 @@ def method(name: str, **parameters: float) -> Method:
 def tuning(texts: Iterable[str]) -> dict[str, float]:
     """The parameters of ``--tune KEY=VALUE`` for `method`; each text may hold several, with commas between.
 
-    Raises `UserError` for what is not of that form; whether the method has such a parameter, `method` says.
+    Raises `UserError` for a text that is not of that form; `method` checks that the parameters exist.
     """
     parameters: dict[str, float] = {}
     for part in (part.strip() for text in texts for part in text.split(",")):

@@ -1,7 +1,7 @@
 """The pilot's four selectors on raw detections, with their published parameters.
 
-A selector filters the detections of one frame and keeps the best few by a score of smallness and doubt. *Small* is a
-yes or no, and `strict_small_only` falls back to what is not small where nothing is.
+A selector filters the detections of one frame and selects the best few by a score of smallness and doubt. *Small* is
+a yes or no, and `strict_small_only` falls back to objects that are not small where there is no small one.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class Selector:
     min_confidence: float
     per_frame: int
     min_side_px: float
-    """Of the box, width and height alike, base pixels."""
+    """Least side of the box, width and height alike, base pixels."""
     kinds: tuple[str, ...] | None
-    """Class words in the sense of `hvt_common.inference.class_names`; None is every class."""
+    """Class words as in `hvt_common.inference.class_names`; None is every class."""
     small_share: float
     """A box that takes less of the frame is small."""
     small_weight: float
@@ -80,7 +80,7 @@ def select(
 
 @dataclass(frozen=True, slots=True)
 class SelectorMethod(Method):
-    """A selector as a method: it sees the candidates that a detection of this very frame backs."""
+    """A selector as a method: it uses only candidates backed by a detection of this very frame."""
 
     selector: Selector
 
