@@ -1,7 +1,7 @@
 """A board on paper: ``make bench-board``. An edge with a quarter of two cores flies 640x360 at 10 fps for a minute.
 
-A control group holds the edge to that, or ``cpulimit`` where none can be made here. What a board lacks beside its
-processor, memory and coolness, is not tried. Ends with code 1 where a bar is missed: no frame is lost for want of
+A control group holds the edge to that, or ``cpulimit`` where none can be made here. Other limits of a
+board, memory and heat, are not tried. Ends with code 1 where a bar is missed: no frame is lost for want of
 processor time, no box is older than a second and a half, and the doctor's forecast is right within a fifth.
 """
 
@@ -36,7 +36,7 @@ _GROUPS = (
     (Path("/sys/fs/cgroup"), "cgroup.controllers", "cpu.max", f"{_QUOTA_US} {_PERIOD_US}"),
     (Path("/sys/fs/cgroup/cpu"), "cpu.cfs_quota_us", "cpu.cfs_quota_us", f"{_QUOTA_US}"),
 )
-"""Of version 2 and 1: where they are, what is there, and what a group writes into which file."""
+"""Of version 2 and 1: where they are, a file that is there, and the text that a group writes into which file."""
 
 
 Hold = Callable[[str], object]
@@ -44,7 +44,7 @@ Hold = Callable[[str], object]
 
 
 def main() -> int:
-    """Fly, print what was measured, and say whether it holds."""
+    """Fly, print the measures, and say whether they hold."""
     with contextlib.ExitStack() as stack:
         hold = _by_group(stack) or _by_cpulimit(stack)
         if hold is None:

@@ -35,7 +35,7 @@ _CLIPS = {
 _OUT = Path("build/compare")
 
 Goal = tuple[str, str, bool | None]
-"""What was asked for, what was measured, and whether it holds; None where it cannot be judged."""
+"""The goal, the measure, and whether it holds; None where it cannot be judged."""
 
 
 def main(argv: list[str]) -> int:
@@ -172,7 +172,7 @@ def _bits_for(agreement: float, curve: list[CompareRow]) -> float | None:
 
 
 def _value_at(bps: float, curve: list[CompareRow], value: Callable[[CompareRow], float]) -> float | None:
-    """What a curve says at so many bits; None below its beginning, its last value beyond its end."""
+    """The value of a curve at so many bits; None below its beginning, its last value beyond its end."""
     if bps < curve[0]["total_bps"]:
         return value(curve[0]) if bps > 0.97 * curve[0]["total_bps"] else None
     for low, high in pairwise(curve):

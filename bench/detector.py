@@ -1,4 +1,4 @@
-"""What a detector costs beside the bare onnxruntime call: `python bench/detector.py`.
+"""The cost of a detector beside the bare onnxruntime call: `python bench/detector.py`.
 
 Both run in turn on the same image, and the median of the ratios of neighbours is shown: a busy machine slows both
 alike.

@@ -1,4 +1,4 @@
-"""What an edge takes of a processor beyond what nobody can do without: at its start, with video alone, by default."""
+"""The processor time of an edge beyond the necessary: at its start, with video alone, by default."""
 
 from __future__ import annotations
 

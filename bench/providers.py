@@ -1,9 +1,9 @@
-"""What each execution provider costs and what it changes: `python bench/providers.py`.
+"""The time of each execution provider, and its change of results: `python bench/providers.py`.
 
 Speed: median ms of the bare network, providers in turn on the same input, so that a busy machine slows all alike.
 Change: on frames of the drone clip, F1 at IoU 0.5 with the same class, against the same network on cpu
 (onnxruntime, float32). A provider that is faster may cost one point: F1 at least 0.99. The embedded detector has no
-such bar: ``auto`` runs it on cpu, and who names another provider has a table of what that costs (docs/models.md).
+such bar: ``auto`` runs it on cpu, and docs/models.md has a table of the cost of others.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""``make bench-stills``: what a still costs in each codec at equal quality, on real crops.
+"""``make bench-stills``: the bytes of a still in each codec at equal quality, on real crops.
 
 Crops are boxes of the VisDrone detector on drone_carpark; residuals build on base streams of 400 and 800 kbps. Every
-codec codes every crop at each step of a ladder. Bytes at equal Y-PSNR are read off crop by crop at what Pillow's JPEG
-q65 (optimised Huffman tables, the paper's still) reaches; bytes at equal KL where the mean over crops of KL(answer on
-the pristine crop || answer on the still) is that of JPEG q65, with MobileNetV2. Between two steps the line is
-straight in the logarithm of bytes.
+codec codes every crop at each step of a ladder. Bytes at equal Y-PSNR are read off crop by crop at the Y-PSNR of
+Pillow's JPEG q65 (optimised Huffman tables, the paper's still); bytes at equal KL where the mean over crops of
+KL(answer on the pristine crop || answer on the still) is that of JPEG q65, with MobileNetV2. Between two steps the
+line is straight in the logarithm of bytes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SPEED_BAR_MS = 2.0
 
 @dataclass(frozen=True)
 class Pair:
-    """A crop of the source and what the base shows of it, in the same pixels."""
+    """A crop of the source and the same part of the base, in the same pixels."""
 
     crop_bgr: Image
     base_bgr: Image

@@ -3,6 +3,4 @@
 import sys
 from pathlib import Path
 
-sys.path.append(
-    str(Path(__file__).parents[1] / "tests" / "support")
-)  # what tests are made of serves here too
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))  # the parts of tests serve here too

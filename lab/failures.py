@@ -1,7 +1,7 @@
 """``make failures``: a flight of the demo scene loses disk, model, viewer and link, one by one, and gets each back.
 
-Edge and ground are two processes, as a user starts them, over the laboratory's relay. What they say is printed as
-they say it, each loss and each return between. At the end stand both tables, and rows of what each loss cost. Losing
+Edge and ground are two processes, as a user starts them, over the laboratory's relay. Their output is printed at
+once, each loss and each return between. At the end stand both tables, and rows with the cost of each loss. Losing
 the disk needs the right to mount; without it that loss is left out, with the reason.
 """
 
@@ -41,7 +41,7 @@ _CALM_S, _LOST_S, _FLIES_S = 12.0, 15.0, 10.0
 """Before the first loss, of each loss, and after each return."""
 _SOON_S, _AGAIN_S = 30.0, 90.0
 _LEAST_FPS = ">= 4"
-"""What an edge codes of a clip on however slow a machine."""
+"""Frames a second that an edge codes of a clip on any machine."""
 _STATUS = re.compile(r"^demo:? +[0-9.]+ s ")
 _LIGHT = LinkState(rate_bps=2_000_000, delay_s=0.02)
 _BALLAST, _TIMING = "ballast", "timing.csv"
@@ -69,7 +69,7 @@ class Loss:
 
     part: str
     said: Sequence[tuple[str, str]]
-    """(edge or ground, what it says of it), each of which is waited for."""
+    """(edge or ground, its sentence), each of which is waited for."""
     take: Callable[[], object]
     give: Callable[[], object] = lambda: None
     video: bool = True
@@ -77,7 +77,7 @@ class Loss:
 
 
 class Flight:
-    """The two processes, and a printer of what they say; rows of what each loss cost."""
+    """The two processes, and a printer of their output; rows with the cost of each loss."""
 
     def __init__(self, edge: Running, ground: Running, *, folder: Path, console: Console) -> None:
         self.sides = {"edge": edge, "ground": ground}
@@ -110,7 +110,7 @@ class Flight:
         self._row(loss, "frames a second afterwards", after, _LEAST_FPS)
 
     def watch(self, seconds: float) -> None:
-        """Print what is said, for so long."""
+        """Print the output for so long."""
         until_s = time.monotonic() + seconds
         while time.monotonic() < until_s:
             self._print()

@@ -1,7 +1,7 @@
-"""How old the picture on the page is, and what viewers cost the ground: ``python -m lab.page``.
+"""How old the picture on the page is, and how much viewers cost the ground: ``python -m lab.page``.
 
 A flight over loopback and headless Chromium on this machine. Glass to glass: from capture to the picture's being
-handed to the screen, both by this machine's clock. The further viewers take what a browser takes, and show nothing.
+handed to the screen, both by this machine's clock. The further viewers read the same as a browser, and show nothing.
 """
 
 from __future__ import annotations

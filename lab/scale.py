@@ -1,10 +1,11 @@
-"""What a group of grounds costs its links: members and edges of a fleet as real Zenoh sessions around a real router.
+"""The cost of a group of grounds on its links: real Zenoh sessions of a fleet around a real router.
 
     python -m lab.scale [EDGES GROUNDS ...]
 
-No video is sent: what is counted is how grounds learn of edges and of each other. Each row is a fleet: bytes a ground
-to learn of everything, bytes a second and ground when nothing changes, bytes a ground when one ground leaves, how
-long it took until each edge was served again, and the router's processor time. Needs root, for network namespaces.
+No video is sent: the traffic by which grounds learn of edges and of each other is counted. Each row is a fleet: bytes
+a ground to learn of everything, bytes a second and ground when nothing changes, bytes a ground when one ground
+leaves, how long it took until each edge was served again, and the router's processor time. Needs root, for network
+namespaces.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ _GOES, _KEYFRAME = "Transmitter.still", "BaseStage._at_keyframe"
 
 
 class Walks:
-    """Takes what `sys.setprofile` tells, of every thread that begins from now on."""
+    """Takes the events of `sys.setprofile`, of every thread that begins from now on."""
 
     def __init__(self) -> None:
         self.largest: dict[str, set[str]] = defaultdict(set)

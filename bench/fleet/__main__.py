@@ -33,7 +33,7 @@ _PLAYED_S = 20.0
 
 
 class Served(NamedTuple):
-    """What a ground did for so many edges."""
+    """The work of a ground for so many edges."""
 
     edges: int
     tracked_fps: float

@@ -1,4 +1,4 @@
-"""Edges without a camera, for benchmarks of the ground: what one encoder made once is sent over many Zenoh sessions.
+"""Edges without a camera, for benchmarks of the ground: the stream of one encoder is sent over many Zenoh sessions.
 
 So the edges take next to nothing of the machine that the ground is measured on.
 """

@@ -70,7 +70,7 @@ class Peaks:
 
 
 def pin_to(cores: set[int]) -> set[int]:
-    """Pin this process, and the threads that it starts from now on; return what it could use before."""
+    """Pin this process, and the threads that it starts from now on; return the cores that it could use before."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)
     return before

@@ -1,4 +1,4 @@
-"""What comes after the recording: an `index` of a folder, `exports` for other programs, `replay` with other models.
+"""Work on recordings: an `index` of a folder, `exports` for other programs, `replay` with other models.
 
 `reading` opens recordings for the others, `joined` makes one of several, `screenshot` a picture; `local_copy` is the
 edge's own. Nothing of the ground imports one.

@@ -27,7 +27,7 @@ _FLUSH_S = 10.0
 
 
 def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, int], fps: float) -> None:
-    """Write the recordings of ``paths`` into ``out``, what each holds below the name of its edge.
+    """Write the recordings of ``paths`` into ``out``, the entities of each below the name of its edge.
 
     Raises:
         UserError: a file is no recording, or two are of the same edge.
@@ -53,7 +53,7 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
 
 
 def _read(path: Path) -> tuple[str, list[Chunk]]:
-    # The edge's id, and everything but the file's own entities; of a damaged file what can be read.
+    # The edge's id, and everything but the file's own entities; of a damaged file its readable part.
     try:
         with path.open("rb"), tempfile.TemporaryDirectory() as folder:
             (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone

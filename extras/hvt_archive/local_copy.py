@@ -32,7 +32,7 @@ _MOST_NAMES = 10_000
 
 
 class LocalCopy:
-    """Keeps what `write` is handed; never overwrites a file. ``wait``: blocks where the card is slower (lockstep).
+    """Keeps the items of `write`; never overwrites a file. ``wait``: blocks where the card is slower (lockstep).
 
     Access units that find no room in the queue are left out up to the next keyframe.
     """

@@ -1,7 +1,7 @@
 """A picture of a recording's screen, without a screen: ``python -m hvt_archive.screenshot FILE.rrd``.
 
-Needs what the viewer needs: a Vulkan driver (Mesa's software one will do; Debian: mesa-vulkan-drivers) and, for HEVC,
-``ffmpeg`` on the PATH (5.1 or later).
+Needs the same as the viewer: a Vulkan driver (Mesa's software one will do; Debian: mesa-vulkan-drivers) and, for
+HEVC, ``ffmpeg`` on the PATH (5.1 or later).
 """
 
 from __future__ import annotations

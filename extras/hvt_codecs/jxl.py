@@ -61,7 +61,7 @@ class JxlCodec(IntraCodec):
 def jxl_size(data: bytes) -> tuple[int, int]:
     """(width, height) of a bare codestream (ISO/IEC 18181-1, annexes D and F); else `StillError`.
 
-    Only what this edge writes is taken: default metadata (so no further channels, preview or animation) and one
+    Only the form of our edge is taken: default metadata (so no further channels, preview or animation) and one
     regular frame of the picture's size in one pass. Anything else may cost far more than a picture of that size.
     """
     if data[:2] != b"\xff\x0a" or len(data) < 16:

@@ -38,7 +38,7 @@ def run_checks(
 ) -> dict[str, Finding]:
     """Each in turn, by name. A `UserError` is a fault; a check without an end is left behind.
 
-    What a check logs belongs to its finding: a warning makes of ``ok`` a ``warning``.
+    The log of a check belongs to its finding: a warning turns ``ok`` into ``warning``.
     """
     return {name: _bounded(check, patience_s) for name, check in checks.items()}
 

@@ -57,7 +57,7 @@ def run(argv: Sequence[str]) -> int:
     words = [one for one in argv if one != "--json"]
     config, given = load(EdgeConfig, words, program="hvt-edge doctor", description=_DESCRIPTION)
     config = check(with_profile(config, given=given.values))
-    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # what a network runs on
+    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # for its provider
     checks = _Checks(config)
     redaction = Redaction([*words, *given.values.values()])
     findings = {
@@ -69,7 +69,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 class _Checks:
-    # The checks in the order of the flight; later ones use what earlier ones have opened.
+    # The checks in the order of the flight; later ones use parts that earlier ones have opened.
 
     def __init__(self, config: EdgeConfig) -> None:
         self._config = config
@@ -184,7 +184,7 @@ class _Checks:
             encode_s, most_fps = self._coded(self._encoder(size, preset=choice.preset))
         meter.measure(scale=1.0, short=False)
         every = detect_every(config.detect_every, fps=self._source.fps)
-        networks = 2 if config.measures else 1  # it looks at the source and at what the base shows of it
+        networks = 2 if config.measures else 1  # it searches the source and the base
         video, wanted = fps * encode_s, self._source.fps * networks * self._detect_s / every
         perceives = min(wanted, most_cores(processors(), others=video))
         free = meter.now.free

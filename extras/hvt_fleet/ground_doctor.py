@@ -34,7 +34,7 @@ def run(argv: Sequence[str]) -> int:
     words = [one for one in argv if one != "--json"]
     config, _ = load(config_class(), words, program="hvt-ground doctor", description=_DESCRIPTION)
     config = checked(config)
-    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # what a network runs on
+    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # for its provider
     checks: dict[str, Callable[[], Finding]] = {
         "models": lambda: _models(config),
         "recordings": lambda: _recordings(config),

@@ -95,7 +95,7 @@ def _rays(pose: Pose, points_px: Points, *, size: tuple[int, int]) -> Rays:
     assert camera is not None, "there is no ray without"
     assert hfov_deg is not None
     yaw, pitch, roll = (math.radians(one) for one in (camera.yaw_deg, camera.pitch_deg, camera.roll_deg))
-    # North, east, down: where the axis points, what is right and what is down in the picture.
+    # North, east, down: the directions of the axis, of right and of down in the picture.
     forward = np.array((math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), -math.sin(pitch)))
     level_right = np.array((-math.sin(yaw), math.cos(yaw), 0.0))
     level_down = np.cross(forward, level_right)
@@ -113,8 +113,8 @@ def places_of_boxes(
 
     An object is taken to stand at the lower edge of its box where the camera looks along the ground, in the middle
     where it looks straight down, and between the two otherwise. The ellipse comes from the errors of the pose, of the
-    field of view and of the box, by what each alone does to the place (error propagation, JCGM 100, 5.1). None where
-    the pose does not say height, direction or field of view, or is at a pole; NaN for an object at or near the
+    field of view and of the box, by the effect of each alone on the place (error propagation, JCGM 100, 5.1). None
+    where the pose does not say height, direction or field of view, or is at a pole; NaN for an object at or near the
     horizon.
     """
     if pose.camera is None or pose.hfov_deg is None or at_a_pole(pose) or not surface.usable(pose):

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import rasterio
 from rasterio import Affine
-from rasterio._err import CPLE_BaseError  # what GDAL raises where rasterio does not translate it
+from rasterio._err import CPLE_BaseError  # GDAL's exceptions that rasterio does not translate
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.transform import from_bounds
@@ -115,7 +115,7 @@ class ElevationModel:
         self.path = path
         try:
             with _errors(), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # what is wrong with a file is said in a sentence
+                warnings.simplefilter("ignore")  # a fault of a file is said in a sentence
                 with rasterio.open(path) as file:
                     placed = file.crs is not None and not file.transform.is_identity
                     if placed:
@@ -248,7 +248,7 @@ class Terrain:
 
     The camera's height above the sea is ``altitude_m``; of a pose that says only a height above the ground, that is
     taken to be above the ground below the first pose. Where the model has no ground below the camera the log says so
-    once, with ``flight``, the name of whose it is. Where the model cannot be read, what is in memory counts, and it
+    once, with ``flight``, the name of whose it is. Where the model cannot be read, the part in memory counts, and it
     is read again after a pause. ``clock`` is nanoseconds without steps.
     """
 
@@ -291,7 +291,7 @@ class Terrain:
         with np.errstate(invalid="ignore", divide="ignore"):
             before, after = above[rows, last], above[rows, hit]
             reach = along[last] + before / (before - after) * (along[hit] - along[last])
-        # What lies in a hole of the model may be hidden by what is there, or not: nobody knows.
+        # The ground in a hole of the model may hide a place behind it, or not: nobody knows.
         seen = np.where(np.isnan(above), 1, 0).cumsum(axis=1)[rows, hit] == 0
         falls = units[:, 2] > math.sin(math.radians(LEAST_DEPRESSION_DEG))
         known = below.any(axis=1) & (hit > 0) & seen & falls & np.isfinite(reach)

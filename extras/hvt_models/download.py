@@ -1,7 +1,7 @@
 """Resumable download of one file over HTTP.
 
-The usual library, pooch, cannot resume: on a thin link 100 MB would start over at each interruption. What is needed
-is a Range header and care with the server's answer (RFC 9110, sections 14 and 15.3.7).
+The usual library, pooch, cannot resume: on a thin link 100 MB would start over at each interruption. Resuming
+takes a Range header and care with the server's answer (RFC 9110, sections 14 and 15.3.7).
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def download(
     A try that brought bytes is followed by another; after ``pauses_s`` tries in a row that brought none it gives up.
 
     Raises:
-        DownloadError: The address does not answer, does not have the file, or has one of another size. What came
-            stays in ``part``.
+        DownloadError: The address does not answer, lacks the file, or has one of another size; the bytes so far stay
+            in ``part``.
         UserError: ``part`` cannot be written.
     """
     failures = 0
@@ -96,7 +96,7 @@ def _answer_failed(url: str, part: Path, error: urllib.error.HTTPError, *, offse
     text = f"answers {error.code} {error.reason}"
     error.close()
     if error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE and offset:
-        part.unlink()  # the file there is shorter than what is here: this is part of something else
+        part.unlink()  # the file there is shorter than our part: this is part of something else
         return
     if error.code in _TRANSIENT_STATUS:
         raise _InterruptedError(text) from error

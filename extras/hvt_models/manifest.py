@@ -1,7 +1,7 @@
 """A model in a manifest, and its reader.
 
 ``manifest.toml`` beside this file is the built-in one; ``added.toml`` in the cache folder has the same form and holds
-what the user added. A table's name is the model's name; its keys are the fields of `ModelEntry`.
+the models that the user added. A table's name is the model's name; its keys are the fields of `ModelEntry`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 OpenVINO is a runtime of its own beside onnxruntime (the package onnxruntime-openvino would overwrite onnxruntime's
 files). It reads the same ONNX file. With the precision hint bf16 the processor's bf16 instructions do the
-convolutions and products; what follows the last of them, such as the decoding of boxes, stays float32.
+convolutions and products; the steps after the last of them, such as the decoding of boxes, stay float32.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The cache folder of models: fetched or brought by hand, and checked each time before use.
 
 Layout: ``NAME.onnx``, or ``NAME.xml`` and ``NAME.bin`` of OpenVINO; ``NAME-DIGEST.part`` while it is being fetched;
-``added.toml`` for what the user added; lock files, so that two processes may fetch at once.
+``added.toml`` for models that the user added; lock files, so that two processes may fetch at once.
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ class Store:
                 scratch.replace(file)
 
     def _part(self, path: Path, file: PinnedFile) -> Path:
-        # The digest is in the name: what was fetched for one pin is never carried on for another.
+        # The digest is in the name: the part of one pin is never carried on for another.
         return path.with_name(f"{path.stem}-{file.sha256[:12]}.part")
 
     @contextmanager
@@ -306,7 +306,7 @@ def _from_address(
     wrong = _what_is_wrong(part, file)
     if wrong:
         part.unlink()
-        if went_on:  # the fault may be in what was there before
+        if went_on:  # the fault may be in the part of an earlier try
             _from_address(url, part, file, progress=progress, pauses_s=pauses_s)
             return
         raise DownloadError(f"{url} gives a file that {wrong.rstrip(',')}")

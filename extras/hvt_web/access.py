@@ -55,7 +55,7 @@ class Access:
         if not self.tokens:
             # Another site's name may be made to lead here: only our own names are answered.
             host = requested_host(headers.get("host", ""))
-            if self.proxy is None:  # what came through a proxy that nobody told of may come from anywhere
+            if self.proxy is None:  # a request through an undeclared proxy may come from anywhere
                 through = any(one in headers for one in (*_FORWARDED, ROLE_HEADER.lower()))
                 return "operator" if is_loopback(host) and not through else None
             if host != self.proxy:  # a page under another name can set the header itself
@@ -101,7 +101,7 @@ def cookie_name(headers: Mapping[str, str]) -> str:
 def crowding(places: Iterable[str], newcomer: str) -> str | None:
     """Without room, the address whose connection is closed, for it has more than a newcomer's; else None.
 
-    What one party may have counts as one: all of an IPv6 network of 64 bits.
+    The addresses that one party may have count as one: all of an IPv6 network of 64 bits.
     """
     known = list(places)
     counts = Counter(map(_party, known))
@@ -130,7 +130,7 @@ def _place(url: str) -> tuple[str, ...]:
 def _cookie(headers: Mapping[str, str]) -> str:
     # Others on this host set cookies too: a strict parser gives up at the first that is out of form.
     cookies = cookie_parser(headers.get("cookie", ""))
-    # The name without a port is what a proxy sends, and what a browser was given by an earlier HVT.
+    # A proxy sends the name without a port, and browsers have it from an earlier HVT.
     return cookies.get(cookie_name(headers)) or cookies.get("hvt", "")
 
 

@@ -38,7 +38,7 @@ class EdgeRequests:
     def request_still(self, edge: str, body: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         """A still of ``box`` (x1, y1, x2, y2 in base pixels) at ``frame``, or at the newest: JPEG, and its place.
 
-        Raises `BadRequestError`, `BusyError`, or what `RemoteEdge.still` does.
+        Raises `BadRequestError`, `BusyError`, or the exceptions of `RemoteEdge.still`.
         """
         box, frame = _box(body.get("box")), _frame(body.get("frame"))
         with _one_of(self._free):

@@ -51,7 +51,7 @@ _LIST_ADDRESSES, _ROW_BYTES = 0x8912, 40 if struct.calcsize("P") == 8 else 32
 """SIOCGIFCONF and struct ifreq of netdevice(7)."""
 _MOST_ADDRESSES = 3
 _PAUSE_S = 5.0
-"""At most so long somebody who looks waits for what failed."""
+"""The longest pause before a failed view is tried again."""
 
 
 class WebPage(Service):
@@ -118,7 +118,7 @@ class WebPage(Service):
             timeout_graceful_shutdown=1,
             server_header=False,
         )
-        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # what browsers send is their affair
+        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # of bad requests
         self._server = _Server(config)
         self._thread = threading.Thread(target=self._run, name="hvt-web", daemon=True)
 
@@ -129,7 +129,7 @@ class WebPage(Service):
         opens = self.feed(flight.info)
 
         def give_way_and_open() -> SessionFeed:
-            lower_priority()  # viewers never slow down what receives and records
+            lower_priority()  # viewers never slow down the flight
             return opens()
 
         yield Opening(
@@ -169,7 +169,7 @@ class WebPage(Service):
         try:
             with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
                 runner.run(self._served())
-        except Exception as error:  # noqa: BLE001 - the flight goes on, and its status says what it lacks
+        except Exception as error:  # noqa: BLE001 - the flight goes on, its status has it
             self._failures.failed(_PART, reason_of(error))
 
     async def _served(self) -> None:

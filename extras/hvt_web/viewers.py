@@ -19,7 +19,7 @@ from hvt_web.video.pictures import RUNGS, THUMBNAIL, Made, Rung
 
 _MOST_QUEUED = 400
 _MOST_QUEUED_BYTES = 4 * 2**20
-"""Of a viewer; above, it loses pictures up to the next keyframe. What it was given to begin with does not count."""
+"""Of a viewer; above, it loses pictures up to the next keyframe. Its first messages do not count."""
 _MOST_TEXTS = 2000
 _MOST_TEXT_BYTES = 4 * 2**20
 """Text is not dropped: a viewer with so much of it unread is given up."""
@@ -61,7 +61,7 @@ class Viewer:
         self._bytes = 0
         self._texts = self._text_bytes = 0
         self._begun = self._begun_bytes = 0
-        """What it was given to begin with, until it has taken all there is."""
+        """Its first messages and their bytes, until it has taken them all."""
         self._waits_for_keyframe = False
         self._there = asyncio.Event()
 
@@ -361,7 +361,7 @@ class Hub:
                 viewer.put_picture(edge.singles[THUMBNAIL][1])
 
     def _show_last(self, edge: EdgePage) -> None:
-        # Where frames have ceased and somebody looks: what he saw was empty, or of when somebody last looked.
+        # Frames have ceased and somebody looks: his page was empty, or of the time when somebody last looked.
         needed: set[Rung] = {"jpeg" if rung in RUNGS else rung for rung in edge.wanted.keys() - edge.streams}
         newest = edge.newest
         if newest in (-1, edge.sought) or newest != edge.came:

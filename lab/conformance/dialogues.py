@@ -1,4 +1,4 @@
-"""Vectors of what a ground makes of messages: reports, objects of the backlog from their chunks, sizes of stills."""
+"""Vectors of a ground's results: reports, objects of the backlog from their chunks, sizes of stills."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ _TRACES = (
         "base0@0+19.5 base1@1+4.5 base2@2+6.0 report@3 base3@4+5.0 base4@5+8.0 report@6 report@7",
     ),
 )
-"""What came, its number, when in ms, its delay."""
+"""The kind of message, its number, its arrival in ms, its delay."""
 _OTHERS: Any = dict.fromkeys(("receiver_id", "sequence", "clock_offset_ns"), 0)
 _OTHERS |= {"clock_error_ns": -1, "backlog": ()}
 """Fields of a report that others fill."""
@@ -118,7 +118,7 @@ _ORDERS = (
     ("damage", "0K 1! 2 3K 4 5K! 6 7K 8"),
     ("the edge starts again", "0K 1 2 +0 +1K +2 3 0K +3"),
 )
-"""Numbers on ``base``, a second apart, so that nobody waits for what is missing: K a keyframe, ! damaged, + of the
+"""Numbers on ``base``, a second apart, so that nobody waits for missing ones: K a keyframe, ! damaged, + of the
 next session."""
 
 
@@ -148,7 +148,7 @@ def base_orders() -> Iterator[dict[str, Any]]:
 
 
 def report_traces() -> Iterator[dict[str, Any]]:
-    """What came and when, and the fields of the reports between."""
+    """Messages with their arrival, and the fields of the reports between."""
     for name, script in _TRACES:
         info = replace(INFO, pace="realtime" if "+" in script else "lockstep")  # in which no delay is known
         counted = Reception(info, clock=int, edge_clock=ClockOffset(), emit=lambda _event: None)
@@ -183,7 +183,7 @@ def report_traces() -> Iterator[dict[str, Any]]:
 
 
 def backlog_dialogues() -> Iterator[dict[str, Any]]:
-    """Chunks in order, each with what the next report says; or what became of the object that was complete."""
+    """Chunks in order, each with the next report, or with the outcome of a complete object."""
     for name, events in _DIALOGUES:
         assembly, whole = BacklogAssembly(), None
         steps: list[dict[str, Any]] = []

@@ -22,7 +22,7 @@ _DRIVER = Path(__file__).with_name("mutants.js")
 
 
 class Mutant(NamedTuple):
-    """One fault: a text of the compiled reader, which is there once, and what stands in its place."""
+    """One fault: a text of the compiled reader, which is there once, and its replacement."""
 
     what: str
     before: str

@@ -54,7 +54,7 @@ MESSAGES: tuple[type[Message], ...] = (
 
 
 def schema() -> dict[str, Any]:
-    """All of it; what JSON has no exact number for stays a whole number here."""
+    """All of it; a value without an exact JSON number stays a whole number here."""
     nested = {
         one.__name__: one for message in MESSAGES for _, kind in kinds(message) for one in nested_of(kind)
     }

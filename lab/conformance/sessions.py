@@ -248,7 +248,7 @@ def _read_poses(reports: list[PoseReport]) -> Iterator[dict[str, Any]]:
 
 
 def _pose_numbers(pose: Pose) -> dict[str, Any]:
-    """As they are coded; what is not there is null."""
+    """As they are coded; a missing value is null."""
 
     def tenths(*values: float) -> list[int]:
         return [round(10 * one) for one in values]

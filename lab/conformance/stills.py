@@ -57,7 +57,7 @@ def vectors() -> Iterator[dict[str, Any]]:
 
 
 def still_cases() -> Iterator[dict[str, Any]]:
-    """What a reader does before a decoder sees anything: no encoder has a part in it, so that the code makes them."""
+    """The steps of a reader before its decoder: no encoder takes part, so the code makes the cases."""
     data = bytes.fromhex("000001 000002 0000 0003 00000004 ff000003 b70000")
     for what, qp, size, cabac in (
         ("QP 15 has no loop filter", 15, (16, 16), b"\x55"),

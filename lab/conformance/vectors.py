@@ -436,7 +436,7 @@ def _coded(message: Message, changed: Mapping[str, bytes]) -> bytes:
 
 
 def _refused() -> Iterator[dict[str, Any]]:
-    """What is damaged, of another version, or out of bounds, each with a checksum that fits unless that is it."""
+    """Messages that are damaged, of another version, or out of bounds; the checksum fits unless it is the fault."""
     for message in _EXAMPLES:
         payload = _PAYLOADS.get(type(message), b"")
         good = message.pack(payload)
@@ -479,7 +479,7 @@ def _values(message: Message) -> list[Any]:
 
 
 def _edges(message: Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
-    """Values at the edges of what each field may hold, by its place: those that are read, or those refused."""
+    """Values at the bounds of each field, by its place: those that are read, or those refused."""
     payload = _PAYLOADS.get(type(message), b"")
     size = len(message.pack(payload))
     values = _values(message)

@@ -2,7 +2,7 @@
 
 First the seeds of every target run once: a target that cannot start ends the whole run with exit code 2. Then each
 target runs in a process of its own, one after the other, until its share of the inputs is done. One that breaks
-begins again with what is left, with its finding set aside. At the end there is one table, and its rows are in
+begins again with the rest, with its finding set aside. At the end there is one table, and its rows are in
 build/fuzz/summary.json.
 """
 
@@ -36,7 +36,7 @@ _WARM = 0.2
 
 @dataclass(frozen=True, slots=True)
 class TargetResult:
-    """What became of one target."""
+    """The result of one target."""
 
     target: str
     inputs: int
@@ -146,7 +146,7 @@ def _run_worker(name: str, *, runs: int, folder: Path, seed: int) -> Path:
     root = Path(__file__).parents[2]
     path = os.pathsep.join([str(root), str(root / "tests" / "support"), *sys.path])
     with log.open("wb") as out:
-        # What libjpeg has to say of each picture goes with it: a log of some megabytes at most.
+        # The messages of libjpeg on each picture go there too: a log of some megabytes at most.
         subprocess.run(
             command,
             stdout=out,

@@ -1,4 +1,4 @@
-"""What a fuzzing target is."""
+"""The contract of a fuzzing target."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def raw_bytes(data: bytes, rng: Random, raw: Bytes) -> bytes:
 class Target:
     """One way in. ``run`` takes any bytes and raises nothing that the code under it does not promise.
 
-    What it promises (`WireError`, `StillError`, `UserError`, None) is caught inside ``run``; everything else that
-    comes out is a finding.
+    Promised exceptions (`WireError`, `StillError`, `UserError`) are caught inside ``run``; any other one is a
+    finding.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What a file from elsewhere says: poses beside a clip, and the log of another ground."""
+"""Files from elsewhere: poses beside a clip, and the log of another ground."""
 
 from __future__ import annotations
 

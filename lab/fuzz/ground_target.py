@@ -51,7 +51,7 @@ def _new_flight(pace: str) -> Flight:
 
 
 _flight = cache(_new_flight)
-"""What the edge answers, and its first access units: nothing of it changes with use."""
+"""The answer of the edge, and its first access units: nothing of it changes with use."""
 
 
 def _opened(info: Info, reports: ReceiverReports) -> Session:

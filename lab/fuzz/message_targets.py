@@ -68,7 +68,7 @@ _UNITS = tuple(BacklogUnit(n, _NOW + n * 66_666_667, n == 0, bytes([n]) * (20 + 
 
 
 def _parsed(message: type[Message]) -> Callable[[bytes], None]:
-    """Parse it; what parses can be sent again and means the same."""
+    """Parse it; a parsed message can be sent again and means the same."""
 
     def run(data: bytes) -> None:
         try:

@@ -33,7 +33,7 @@ _BASE_SIZE = (96, 64)
 
 @cache
 def _crop(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """A crop and what the base leaves of it."""
+    """A crop and the same part of the base."""
     crop = textured(*size)
     return crop, washed_out(crop)
 

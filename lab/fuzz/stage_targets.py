@@ -1,4 +1,4 @@
-"""Messages that parse, and what they do to the stages behind the parser: reassembly, commands, reports."""
+"""Messages that parse, against the stages behind the parser: reassembly, commands, reports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rigs.command_rig import SESSION, Rig
 
 _MS = 1_000_000
 _STEP = struct.Struct("<BbbH")
-"""A base message: session and flags, sequence and frame index against what the last one said, milliseconds.
+"""A base message: session and flags, sequence and frame index as differences from the last message, milliseconds.
 
 An odd number of these: it is sent once more. A byte behind the last: the edge does so.
 """

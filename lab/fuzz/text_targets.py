@@ -1,4 +1,4 @@
-"""What a user, a file or a model's metadata says: command lines, TOML, Zenoh configurations, rosters, manifests."""
+"""Text of a user, a file or a model's metadata: command lines, TOML, Zenoh configurations, rosters, manifests."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
     PYTHONPATH=.:tests/support python -m lab.fuzz.worker TARGET --runs N --folder build/fuzz
 
-Leaves ``TARGET.json`` in the folder: inputs so far, memory over time, the slowest input; and what broke, if anything.
+Leaves ``TARGET.json`` in the folder: inputs so far, memory over time, the slowest input; and the finding, if any.
 The input that broke it lies in ``found/``.
 """
 
@@ -40,7 +40,7 @@ _FROM_SEED = 0.25
 
 @dataclass
 class _Progress:
-    """What the run leaves behind."""
+    """The record of the run."""
 
     target: str
     inputs: int = 0
@@ -70,7 +70,7 @@ class Watched:
         self._began_s, self._written_s = time.process_time(), time.monotonic()
 
     def __call__(self, data: bytes) -> None:
-        """One input; raises what breaks it, or MemoryError where it takes too much."""
+        """One input; raises its finding, or MemoryError where it takes too much."""
         progress, began_s = self._progress, time.process_time()
         progress.inputs += 1
         try:
@@ -105,7 +105,7 @@ def _resident_kb() -> int:
 
 
 def _prepared(target: Target, folder: Path, seeds: list[bytes]) -> list[str]:
-    """The folders of libFuzzer: what it finds interesting goes to the first."""
+    """The folders of libFuzzer: it stores interesting inputs in the first."""
     corpus, first = folder / "corpus" / target.name, folder / "seeds" / target.name
     for one in (corpus, first, folder / "found"):
         one.mkdir(parents=True, exist_ok=True)

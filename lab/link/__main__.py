@@ -27,7 +27,7 @@ BUILD = Path("build")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run what is arguments for; 1 where a bar does not hold and ``--strict`` is given."""
+    """Run the scenarios of the arguments; 1 where a bar does not hold and ``--strict`` is given."""
     return exit_with_sentence(_run, program="link", argv=argv)
 
 

@@ -1,9 +1,9 @@
-"""``kill -9`` of edge or ground at random moments of short flights: what is left must be readable, and nearly whole.
+"""``kill -9`` of edge or ground at random moments of short flights: the files must be readable, and nearly whole.
 
 ``PYTHONPATH=.:tests/support python -m lab.link.kills --count 50 --seed 0``. Each flight goes over a link that comes
 and goes (`kills.toml`); one kill in five falls into the ending, when files are closed. Ctrl-C ends the other side,
-which must end well. What should be there is told by ``hvt-ground --timing``, which both sides of a flight are
-compared with, and for the store by the time of the last frame in it.
+which must end well. The files of both sides are compared with ``hvt-ground --timing``, and for the store by the time
+of the last frame in it.
 """
 
 from __future__ import annotations
@@ -75,21 +75,21 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What one kill left."""
+    """The files after one kill."""
 
     trial: Trial
     frames: int
     """That the ground had shown."""
     recording_missing_s: float | None
-    """Of what the ground had shown, from the first frame that is not there on; None where it cannot be read."""
+    """Seconds of shown video from the first missing frame on; None where the file cannot be read."""
     matroska_missing_s: float | None
-    """Of what the ground had got."""
+    """Seconds of the received video."""
     matroska_behind_kill_s: float
     """From the last frame in it to the kill; the time to encode, and frames that were given up, are in it."""
     ended: bool
     """It had ended by itself, before the kill."""
     store: StoreLeft
-    """What the edge had kept."""
+    """The store of the edge."""
     survivor: int | None
     """Exit code of the other side; None where it had to be killed."""
     said: str = field(default="", repr=False)

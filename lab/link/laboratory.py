@@ -1,4 +1,4 @@
-"""Runs hvt-edge and hvt-ground as real processes over a bad link, and gathers what became of it."""
+"""Runs hvt-edge and hvt-ground as real processes over a bad link, and gathers the results."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Carrier = Literal["relay", "netns", "tun"]
 CARRIERS: tuple[Carrier, ...] = ("relay", "netns", "tun")
 
 _TAKES_IN_S = 2.5
-"""How long the ground may take in what is on its way when the edge has ended."""
+"""How long the ground may take in messages on their way when the edge has ended."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What is to be run."""
+    """A run as requested."""
 
     scenario: Scenario
     source: str
@@ -52,13 +52,13 @@ class Run:
 
     @property
     def script(self) -> Script:
-        """What the link will do."""
+        """The course of the link."""
         script = self.scenario.script(self.length, seed=self.seed, lasts=self.lasts)
         return script.without_delay() if self.carrier == "netns" else script
 
     @property
     def transport(self) -> Transport:
-        """What edge and ground speak over it; a shaped veth is there for the kernel's TCP."""
+        """The protocol of edge and ground over it; a shaped veth is there for the kernel's TCP."""
         return "tcp" if self.carrier == "netns" else self.scenario.transport
 
 

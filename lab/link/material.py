@@ -1,4 +1,4 @@
-"""What the edge plays: a clip as long as the scenario, made by repeating a shorter one."""
+"""The source of the edge: a clip as long as the scenario, made by repeating a shorter one."""
 
 from __future__ import annotations
 

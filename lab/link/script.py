@@ -1,4 +1,4 @@
-"""A scenario file, read, checked and made into a script of what the link does over time.
+"""A scenario file, read, checked and made into a script of the link over time.
 
 A script is a pure function of the file, the length and the seed: relay and namespaces play the same one.
 """
@@ -39,13 +39,13 @@ class Scenario:
     budget: str
     """Of the edge, as its ``--budget`` takes it."""
     bars: Mapping[str, str]
-    """What a measure must be: ``{"decodable frames, %": ">= 97"}``."""
+    """The bars of measures: ``{"decodable frames, %": ">= 97"}``."""
     transport: Transport
     """``udp`` shows losses as losses; ``tcp`` and ``quic`` turn them into delay."""
     _tables: Mapping[str, Mapping[str, Any]] = field(repr=False)
 
     def script(self, length: Length, *, seed: int = 0, lasts: str | None = None) -> Script:
-        """The link over time; the seed draws the bursts of loss. ``lasts`` stretches what repeats (``60min``)."""
+        """The link over time; the seed draws the bursts of loss. ``lasts`` stretches the repetitions (``60min``)."""
         plan = {**self._tables[length], **({} if lasts is None else {"lasts": lasts})}
         return _script(self.name, self._tables["link"], plan, seed=seed)
 
@@ -128,7 +128,7 @@ _STATE = ("rate", "delay", "jitter", "loss", "reorder")
 
 
 def _state(before: LinkState, table: Mapping[str, Any], *, where: str) -> LinkState:
-    """The state with what the table changes of it."""
+    """The state with the changes of the table."""
     changes: dict[str, Any] = {}
     if "rate" in table:
         changes["rate_bps"] = parse_bitrate(str(table["rate"]), name=f"{where}: rate")

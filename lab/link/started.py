@@ -1,4 +1,4 @@
-"""One process of the laboratory: any command, so that it can run inside a namespace, and what it left."""
+"""One process of the laboratory: any command, so that it can run inside a namespace, and its output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a link does over time: phases of constant rate, delay and loss, and darkness. Pure."""
+"""A link over time: phases of constant rate, delay and loss, and darkness. Pure."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Script:
     phases: tuple[Phase, ...]
     lasts_s: float
     queue_bytes: int
-    """What the sender's end of the link holds before it drops (UDP) or pushes back (TCP)."""
+    """Bytes that the sender's end of the link holds before it drops (UDP) or pushes back (TCP)."""
     falls_s: tuple[float, ...] = ()
     """When the rate is stepped down."""
     rises_s: tuple[float, ...] = ()
@@ -101,7 +101,7 @@ class Script:
         return replace(self, phases=(Phase(0.0, first),))
 
     def without_delay(self) -> Script:
-        """What namespaces can play: a floor that counted a delay they do not have would flatter."""
+        """The script that namespaces can play: a floor with a delay that they do not have would flatter."""
         return replace(
             self,
             phases=tuple(

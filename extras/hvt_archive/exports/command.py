@@ -95,7 +95,7 @@ def _rows(recorded: Recorded) -> Iterator[tuple[object, ...]]:
 def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
     """The name to write to; it takes the place of ``path`` at the end, and is removed where that fails.
 
-    A link stays one: what it leads to is replaced.
+    A link stays one: its target is replaced.
 
     Raises:
         UserError: it cannot be written, or is to be ``new`` and somebody has made one meanwhile.

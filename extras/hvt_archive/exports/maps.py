@@ -1,7 +1,7 @@
 """Exports for maps: GeoJSON (RFC 7946) and KML (OGC 12-007r2).
 
-The camera's way is one line; each track is one, of its places at most once a second. A track that stayed within what
-its places may be off by is a point, the surest of them. A way that crosses the antimeridian is in parts.
+The camera's way is one line; each track is one, of its places at most once a second. A track that stayed within
+the errors of its places is a point, the surest of them. A way that crosses the antimeridian is in parts.
 """
 
 from __future__ import annotations

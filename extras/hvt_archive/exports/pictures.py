@@ -17,7 +17,7 @@ from hvt_ground.recordings.row import Recorded
 from hvt_ground.sinks.event_tables import plain_cells
 
 STILL_COLUMNS = ("file", "base_file", "frame_index", "capture_utc", "caption")
-"""``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame_index`` is
+"""``base_file`` shows the base stream at that place, empty where the recording has none; ``frame_index`` is
 the one, from 0, that the still shows; ``caption`` what it did, as under the pair on the screen."""
 _JPEG_QUALITY_PCT = 95
 
@@ -77,7 +77,7 @@ def _annotations(
 
 
 def write_stills(recorded: Recorded, folder: Path) -> None:
-    """Each still as the recording shows it, what the base had there, and ``stills.csv`` (`STILL_COLUMNS`).
+    """Each still as the recording shows it, the base at that place, and ``stills.csv`` (`STILL_COLUMNS`).
 
     Raises `UserError` where the recording has none.
     """

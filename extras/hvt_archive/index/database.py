@@ -52,7 +52,7 @@ class Index:
         self._path = path = folder / INDEX
         try:
             self._database = _opened(path)
-        except sqlite3.OperationalError:  # locked, not writable, disk full: what is there may be good
+        except sqlite3.OperationalError:  # locked, not writable, disk full: the database may be good
             raise
         except sqlite3.DatabaseError as error:
             _set_aside(path, error)
@@ -63,7 +63,7 @@ class Index:
         self._database.close()
 
     def put(self, row: RecordingRow) -> None:
-        if not self._path.exists():  # what is written would be in no file
+        if not self._path.exists():  # the row would be in no file
             raise sqlite3.OperationalError(f"{self._path} was removed")
         values = [getattr(row, name) for name in _COLUMNS]
         with self._database as transaction:

@@ -147,7 +147,7 @@ def remove_video(path: Path) -> None:
     try:
         with tempfile.TemporaryDirectory() as folder:
             source = readable(path, Path(folder) / path.name)
-            # By Rerun's own program: it keeps screen and footer, and what it takes in memory is not the ground's.
+            # By Rerun's own program: it keeps screen and footer, and its memory is not the ground's.
             command = [
                 viewer_program(),
                 "rrd",

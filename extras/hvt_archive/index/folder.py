@@ -37,7 +37,7 @@ _DOUBT_NS = 3600 * SECOND_NS
 class IndexWriter(SinkWriter[RecordingRow | None]):
     """Writes the index; a sink for one thread. Files are removed when one was closed, or an item is None.
 
-    At the beginning it is brought to what is in the folder: files that are gone are forgotten, those that a killed
+    At the beginning it is compared with the folder: files that are gone are forgotten, those that a killed
     program left are read, and so are those that it does not know, as far as they have a name of ours.
 
     A wall clock may be years off, and be set at any time: ages count the time since the index learned of a file,

@@ -31,7 +31,7 @@ class Retention:
 
     @property
     def trusted_ns(self) -> int:
-        """What the clock's word for the time between two boots counts at most.
+        """The most that the clock's word for the time between two boots counts.
 
         A clock that is wrong once, by however much, makes no file of today too old.
         """

@@ -56,10 +56,10 @@ _ONE_COMPONENT = {MAP_CAMERA: _POSE, SESSION: _INFO, STILL_MESSAGES: _MESSAGE}
 _SAMPLE, _PICTURE, _CAPTION = "VideoStream:sample", "EncodedImage:blob", "Boxes2D:labels"
 
 _ODD = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
-"""What a file raises that is no recording, or has other values under the names of ours."""
+"""Exceptions from a file that is no recording, or has other values under our names."""
 
 _Rows = dict[tuple[str, str], list[Timed] | SpooledRows]
-"""By entity and component; what grows with the flight is on disk."""
+"""By entity and component; components that grow with the flight are on disk."""
 
 
 @dataclass(frozen=True)
@@ -203,9 +203,9 @@ class _File:
         return samples[0][:2] if samples else (0, 0)
 
     def go_on_from(self, before: _Rows) -> None:
-        """Take what the files before it had into account, if there are any.
+        """Take the rows of the files before it into account, if there are any.
 
-        A file that follows another begins with what is on the screen: stills that are known, and boxes of each layer
+        A file that follows another begins with the present screen: stills that are known, and boxes of each layer
         that has any. One of a ground that was started again begins with nothing.
         """
         if not before:

@@ -70,7 +70,7 @@ def _no_space(error: OSError) -> UserError:
 
 
 class SpooledRows(Sequence[Timed]):
-    """Rows of one component, in order of frames once they were sorted; values are bytes, or what JSON holds."""
+    """Rows of one component, in order of frames once they were sorted; values are bytes, or of JSON."""
 
     def __init__(self, spool: Spool, *, blobs: bool) -> None:
         self._spool, self._blobs = spool, blobs

@@ -1,4 +1,4 @@
-"""``hvt-ground replay FILE [SETTINGS]``: receive again what was received, with other models or rules.
+"""``hvt-ground replay FILE [SETTINGS]``: receive a flight again, with other models or rules.
 
 It is the ground of the flight without its link: nothing is skipped for lack of time, so that the same file and the
 same settings give the same recording, tables and summary.
@@ -61,7 +61,7 @@ def messages_of(recorded: Recorded) -> Iterator[Received]:
     """The messages in the order in which they were known, the session's first; times are capture times.
 
     Each is made when it is its turn. Stills are the JPEGs of the recording. Raises `UserError` where that does not
-    say what session it is of.
+    name its session.
     """
     info = recorded.info
     if info is None:

@@ -73,7 +73,7 @@ def _attempt(settings: LinkSettings, keys: EdgeKeys, patience: float) -> Info | 
     for path, value in _CONFIG.items():
         config.insert_json5(path, json.dumps(value))
     found: queue.SimpleQueue[Info | None] = queue.SimpleQueue()
-    # Zenoh has no time-out of its own for an address that drops what is sent to it.
+    # Zenoh has no time-out of its own for an address that drops all packets.
     threading.Thread(
         target=lambda: found.put(_info(config, keys, answer_s=patience * _ANSWER_S)),
         name="hvt-duplicate-edge",

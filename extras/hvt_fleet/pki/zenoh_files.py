@@ -1,8 +1,8 @@
-"""The Zenoh configurations of a fleet: mutual TLS, and access control that denies what it does not name.
+"""The Zenoh configurations of a fleet: mutual TLS, and access control that allows the named keys alone.
 
-Both ends of a link check. A ground or a router lets an edge write under its own id only and tells each only what is
-meant for it; an edge or a router answers the grounds it knows, and passes ``control`` on from those that may command.
-Zenoh identifies who is at the other end by the common name of the certificate. What is not allowed is dropped in
+Both ends of a link check. A ground or a router lets an edge write under its own id only and gives each only its own
+messages; an edge or a router answers the grounds it knows, and passes ``control`` on from those that may command.
+Zenoh identifies who is at the other end by the common name of the certificate. Forbidden messages are dropped in
 silence, so `hvt_fleet.link.diagnose` says in its own words why nothing comes.
 """
 
@@ -62,7 +62,7 @@ def ground_file(ground: GroundMember, roster: Roster, *, folder: str = KEYS_FOLD
     grants = {edge: _toward_edge(edge, command=ground.command) for edge in edges}
     through = [rule for edge in edges for rule in _toward_edge(edge, command=ground.command)]
     grants |= {router.name: [*through, *_AMONG_GROUNDS] for router in roster.routers if edges}
-    # A second program of this ground, or another ground, may ask by way of this one: it gets what is its own.
+    # A second program of this ground, or another ground, may ask by way of this one: it gets its own answers.
     for other in roster.grounds:
         shared = [edge for edge in edges if other.may_watch(edge)]
         if shared:

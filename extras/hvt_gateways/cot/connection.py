@@ -1,7 +1,7 @@
 """One connection to where Cursor on Target goes, over pytak: UDP, TCP or TLS, in a thread and loop of its own.
 
-pytak makes the connection, so that its environment variables say about certificates and multicast what they say in
-its other programs. Of these only `VARIABLES` are used: no enrolment, which alone needs aiohttp.
+pytak makes the connection, so that its environment variables mean the same for certificates and multicast as in its
+other programs. Of these only `VARIABLES` are used: no enrolment, which alone needs aiohttp.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def _settings(url: str, environment: Mapping[str, str]) -> dict[str, str]:
 class CotConnection(SinkWriter[CotMessage]):
     """An open connection; the sink of a `QueuedSink`, which makes it anew once it has failed.
 
-    `log` never waits: of each uid the newest event is to be sent, in turn. What the other side sends is read and
+    `log` never waits: of each uid the newest event is to be sent, in turn. Messages of the other side are read and
     thrown away. Raises `UserError` where it cannot be opened within five seconds; `log` does so after it has failed.
     """
 
@@ -192,7 +192,7 @@ class CotConnection(SinkWriter[CotMessage]):
         self._notify()
 
     def close(self, hurry: threading.Event | None = None) -> None:
-        """Send what waits, within a second, and close."""
+        """Send waiting events, within a second, and close."""
         with self._lock:
             self._ending = True
             if hurry is not None and hurry.is_set():
@@ -215,7 +215,7 @@ class CotConnection(SinkWriter[CotMessage]):
     def _run(self) -> None:
         try:
             self._loop.run_until_complete(self._use())
-        except Exception as error:  # noqa: BLE001 - pytak and the network raise what they like
+        except Exception as error:  # noqa: BLE001 - pytak and the network raise anything
             failure = UserError(f"{self._url}: {_reason(error, self._url)}")
             with self._lock:
                 self._error = failure
@@ -261,7 +261,7 @@ async def _send_one(writer: Any, data: bytes) -> None:
 
 
 async def _read(reader: asyncio.StreamReader | None) -> None:
-    """A server passes on what others say; who does not take it is cut off."""
+    """A server passes on messages of others; a client that does not read them is cut off."""
     if reader is None:
         await asyncio.Event().wait()
         return

@@ -44,9 +44,9 @@ def no_address(_still: Refinement) -> str:
 
 
 class SessionReporter(SinkWriter[Event]):
-    """Reports one session to ``targets``; ``clock`` is the ground's, ``wall_ns`` what receivers go by.
+    """Reports one session to ``targets``; ``clock`` is the ground's, ``wall_ns`` the time of receivers.
 
-    What was stored at the edge, and what is older than its time to go stale, is not reported. A track that is lost is
+    Stored events, and those older than their time to go stale, are not reported. A track that is lost is
     not reported any more and goes stale by itself, as all do when the session ends.
     """
 
@@ -234,7 +234,7 @@ def _why_unplaced(pose: Pose | None) -> str:
     | the pose                                   | the reason                                     |
     |--------------------------------------------|------------------------------------------------|
     | never came                                 | that                                           |
-    | lacks height, direction or field of view   | what it lacks                                  |
+    | lacks height, direction or field of view   | the missing fields                             |
     | has only an altitude above the sea         | ``--terrain`` is missing, or has no ground     |
     | says a height of 0 or less                 | that                                           |
     | is whole                                   | horizon, age, or ``--terrain`` has no ground   |

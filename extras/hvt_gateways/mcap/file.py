@@ -92,7 +92,7 @@ class McapFile(SinkWriter[Event]):
         frame_index, capture_ns = at.frame_index, at.capture_ns
         if topic == "stills" and isinstance(at, Shown):
             frame_index, capture_ns = at.shown_at
-        # What no timestamp can hold is held at its end: times come from the wire.
+        # Times come from the wire: one beyond the range of timestamps becomes the nearest that can be held.
         capture_ns = min(max(capture_ns, 0), _LATEST_NS)
         message.timestamp.CopyFrom(Timestamp(seconds=capture_ns // SECOND_NS, nanos=capture_ns % SECOND_NS))
         if isinstance(message, CompressedVideo | CompressedImage | LocationFix):

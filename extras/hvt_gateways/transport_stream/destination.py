@@ -43,7 +43,7 @@ class Address:
 
     @property
     def shown(self) -> str:
-        """Without what follows a question mark, which may be a secret."""
+        """Without the query behind a question mark, which may hold a secret."""
         return self.url.partition("?")[0]
 
     def of_edge(self, edge: str) -> Address:
@@ -51,7 +51,7 @@ class Address:
 
     @property
     def srt_url(self) -> str:
-        """With bounds on what it may wait for."""
+        """With bounds on its waits."""
         given = parse_qs(urlsplit(self.url).query, keep_blank_values=True)
         waits = "&".join(f"{name}={value}" for name, value in _SRT_WAITS.items() if name not in given)
         return f"{self.url}{'&' if given else '?'}{waits}"
@@ -74,7 +74,7 @@ def destination(text: str) -> Address | Path:
 
 
 def check_destination(text: str | None) -> None:
-    """Refuse before anything is received what could not be sent to; `UserError`."""
+    """Refuse an impossible destination before anything is received; `UserError`."""
     where = None if text is None else destination(text)
     if isinstance(where, Address) and where.scheme == "srt" and not _has_srt():
         raise UserError(
@@ -141,7 +141,7 @@ class Addresses:
 
     @contextmanager
     def taken(self, address: Address, *, edge: str) -> Iterator[None]:
-        """Taken, and free again where what follows fails."""
+        """Taken, and free again where the next steps fail."""
         self.take(address, edge=edge)
         try:
             yield
@@ -209,7 +209,7 @@ class StreamFile:
 class Datagrams:
     """UDP to one host or group; never waits. `UserError` where the name leads nowhere.
 
-    What the network does not take is lost, and said once: the receiver may come later.
+    A datagram that the network does not take is lost, and that is said once: the receiver may come later.
     """
 
     def __init__(self, address: Address) -> None:

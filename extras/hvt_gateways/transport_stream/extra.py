@@ -13,7 +13,7 @@ from hvt_common.errors import named_path
 from hvt_ground.config import GroundConfig, Written
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
-if TYPE_CHECKING:  # what writes it opens PyAV, which settings alone do without
+if TYPE_CHECKING:  # it opens PyAV, which settings alone do without
     from hvt_ground.recordings.row import Recorded
     from hvt_ground.sinks import Outputs
 

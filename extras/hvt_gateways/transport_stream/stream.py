@@ -1,4 +1,4 @@
-"""Writes a session as MPEG-TS: the base stream as it came, and beside it KLV of where it was and what it shows.
+"""Writes a session as MPEG-TS: the base stream as it came, and KLV beside it with the place of the camera and tracks.
 
 MISB ST 1402, asynchronous carriage: a KLV packet has the time of its frame, and may come after it.
 """
@@ -49,7 +49,7 @@ _USUAL_FPS: Final = 15.0
 class TransportStream(SinkWriter[Event]):
     """Writes into ``output``, or to an SRT URL; ``trail`` has the poses where all are known before.
 
-    ``ended`` is called once after the end. What was stored at the edge during an outage is left out: a stream does
+    ``ended`` is called once after the end. Events stored at the edge during an outage are left out: a stream does
     not go back.
     """
 
@@ -85,7 +85,7 @@ class TransportStream(SinkWriter[Event]):
                 self._output.close()
 
     def log(self, item: Event) -> None:
-        """Write a picture or what is known of a frame; the rest passes by."""
+        """Write a picture or the facts of a frame; other events pass by."""
         match item:
             case VideoSample(stored=False):
                 self._picture(item)
@@ -101,7 +101,7 @@ class TransportStream(SinkWriter[Event]):
         self._moments.forget()
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Say what waits, and end."""
+        """Write waiting facts, and end."""
         container = self._container
         if container is None:
             return

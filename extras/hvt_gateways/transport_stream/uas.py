@@ -63,7 +63,7 @@ def whole(number: int) -> bytes:
 def signed(value: float, limit: float, *, size: int) -> bytes:
     """From -limit … limit onto -(2^(8·size-1)-1) … 2^(8·size-1)-1 (ST 0601, items 6, 13 and others).
 
-    What is out of range is the lowest integer, which means just that, or an error.
+    A value out of range becomes the lowest integer, which means "out of range" or an error.
     """
     top = (1 << (8 * size - 1)) - 1
     if not abs(value) <= limit:

@@ -22,7 +22,7 @@ def euler_deg(w: float, x: float, y: float, z: float) -> tuple[float, float, flo
     """Yaw, pitch and roll of the unit quaternion of a device in north-east-down (MAVLink, common.xml).
 
     Order yaw, pitch, roll. Straight up or down only their sum or difference is known: it is the yaw, and the roll 0.
-    None for what is no turn: zeros or NaN, from a device that does not know.
+    None for an impossible quaternion: zeros or NaN, from a device that does not know.
     """
     length = math.hypot(w, x, y, z)
     if not abs(length - 1) <= _UNIT:

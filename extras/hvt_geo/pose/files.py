@@ -1,7 +1,7 @@
 """Poses from a file beside a clip: a table with names in its first line, DJI's subtitles, or a GPS track.
 
 A file's time 0 is the clip's first frame: a table says ``time_s``, subtitles have their own times, and of UTC times
-the earliest counts as 0. What cannot be read is left out and counted, unless it is half of the file.
+the earliest counts as 0. Rows that cannot be read are left out and counted, unless they are half of the file.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ COLUMNS = (
     *("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg", "yaw_deg", "pitch_deg", "roll_deg"),
     *("hfov_deg", "position_error_m", "height_error_m", "angle_error_deg"),
 )
-"""Of a table. One of the first two, latitude and longitude are needed; `Pose` and `Orientation` say what each means:
+"""Of a table. One of the first two, latitude and longitude are needed; `Pose` and `Orientation` define each:
 ``camera_…`` is where the optical axis points, the plain angles are the platform's."""
 _MOST_BYTES = 64_000_000
 _BOUNDS: Mapping[str, tuple[float, float]] = {
@@ -58,14 +58,14 @@ _ANY_TIME = (-1e11, 1e11)
 _LONGEST_PAUSE_S = 86_400.0
 _M_A_DEGREE = 111_320.0
 _MOST_SPEED, _MOST_M = 700.0, 1000.0
-"""Metres a second, and what receivers may err: further away a place is a fault."""
+"""Metres a second, and metres of a receiver's error: a place further away is a fault."""
 _POINTS = ("trkpt", "rtept", "wpt")
 _BEFORE_HEAD = re.compile(r"\s*(?:#.*|sep=.)?\s*$")
 """Lines before the names: a comment, the word of a spreadsheet, or nothing."""
 _NOWHERE = 0.001
 """Degrees around 0, 0: there a receiver without a fix says it is."""
 _UNKNOWN_YAW = (655.35, 65535.0)
-"""What senders of MAVLink write where they know none, in degrees and in hundredths."""
+"""MAVLink senders write these for an unknown yaw, in degrees and in hundredths."""
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+\s*", re.ASCII)
 _Values = Mapping[str, float]
 
@@ -109,7 +109,7 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
 
 
 def _text(content: bytes) -> str:
-    # In the encoding that its byte order mark says, else UTF-8; what is none is replaced, for it is no number.
+    # In the encoding of its byte order mark, else UTF-8; invalid bytes are replaced, for they are no numbers.
     try:
         text = decoded(content)
     except UnicodeDecodeError:

@@ -107,7 +107,7 @@ class Address:
 class Connection:
     """An address that is opened again where it is lost, after pauses that grow; used by one thread.
 
-    What is not there yet at first is opened later, which the log says. Raises `UserError` for what can never be.
+    An address that is not there yet is opened later, which the log says. Raises `UserError` for an impossible one.
     """
 
     def __init__(self, address: Address, *, stop: threading.Event, silent_s: float = _SILENT_S) -> None:
@@ -239,7 +239,7 @@ MAX_FRAME_BYTES = 280
 class FrameParser:
     """Of a stream, whose frames may begin in one read and end in the next, or of datagrams, which may be cut alike.
 
-    Of a datagram what is left of the one before may be noise: it counts where more messages come out with it.
+    The rest of the datagram before may be noise: it counts where more messages come out with it.
     """
 
     def __init__(self, *, is_stream: bool) -> None:

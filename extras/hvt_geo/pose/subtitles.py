@@ -113,7 +113,7 @@ def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
 def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callable[[str], None]) -> bool:
     """Which of the first two numbers of GPS(…) is the latitude; the third is its height, or a count of satellites.
 
-    | what is there | is first |
+    | numbers | first is |
     |---|---|
     | a first number beyond 90 | the longitude |
     | a second number beyond 90 | the latitude |

@@ -2,8 +2,8 @@
 
 Weighted boxes fusion (Solovyev, Wang and Gabruseva, Image and Vision Computing 2021): boxes of one group (vehicle,
 person, see `class_names`) that overlap become one, whose sides are means weighted by confidence. The paper divides
-the confidence of what not every detector found by their number. That suits detectors of one training set; those here
-know different views, and the surest of a cluster counts (docs/embedded-models.md has both).
+the confidence of an object that not every detector found by their number. That suits detectors of one training set;
+those here know different views, and the surest of a cluster counts (docs/embedded-models.md has both).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LEAST_WEIGHT = 1e-9
 
 
 def on_scale_of(confidences: npt.NDArray[np.float32], own: float, wanted: float) -> npt.NDArray[np.float32]:
-    """Confidences shifted, as log odds, so that what was ``own`` is ``wanted``.
+    """Confidences shifted, as log odds, so that ``own`` becomes ``wanted``.
 
     Each part has its own confidence from which a detection counts, and the ensemble has one.
     """

@@ -1,4 +1,4 @@
-"""A detector without weights: what moves against the ground, seen from a camera that may move itself.
+"""A detector without weights: objects that move against the ground, seen from a camera that may move itself.
 
 Each image is compared with the last few, brought into its own coordinates by the camera's motion:
 
@@ -13,9 +13,10 @@ Each image is compared with the last few, brought into its own coordinates by th
 4. The threshold follows the noise of these very differences (median absolute deviation, Rousseeuw and Croux 1993), so
    coding noise stays below it; closing, connected components and merging make boxes.
 
-It is meant to be called on every n-th frame, three to five times a second, and finds what moves by about its own size
-within the calls it remembers. Limits: it is silent in its first calls, a shadow belongs to its object, parallax of
-tall things near a fast camera looks like motion, and what has stood still for a second or two is not seen.
+It is meant to be called on every n-th frame, three to five times a second, and finds objects that move by about their
+own size within the calls it remembers. Limits: it is silent in its first calls, a shadow belongs to its object,
+parallax of tall things near a fast camera looks like motion, and an object that stood still for a second or two is
+not seen.
 """
 
 from __future__ import annotations

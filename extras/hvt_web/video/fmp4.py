@@ -177,7 +177,7 @@ def _avc_configuration(sequence_set: bytes, picture_set: bytes) -> bytes:
 
 
 def _hevc_configuration(*sets: bytes) -> bytes:
-    # 4:2:0 and 8 bits, which is what a base stream has; one temporal layer, nested; lengths of four bytes.
+    # 4:2:0 and 8 bits, as of every base stream; one temporal layer, nested; lengths of four bytes.
     head = b"\1" + _profile(sets[1]) + struct.pack(">HBBBBHB", 0xF000, 0xFC, 0xFD, 0xF8, 0xF8, 0, 0x0F)
     arrays = (struct.pack(">BHH", 0x80 | one[0] >> 1 & 0x3F, 1, len(one)) + one for one in sets)
     return head + bytes([len(sets)]) + b"".join(arrays)

@@ -1,6 +1,6 @@
 """The live picture in the three ways in which a browser may show it, made once an edge and only while somebody looks.
 
-``hevc`` copies what came over the link, ``h264`` codes it again, ``jpeg`` is two pictures a second. A picture for the
+``hevc`` copies the units of the link, ``h264`` codes them again, ``jpeg`` is two pictures a second. A picture for the
 wall of edges is a small JPEG.
 """
 
@@ -120,7 +120,7 @@ class Pictures:
         self._copied = self._decoder = None
 
     def close(self) -> None:
-        """Keep what `last` needs alone."""
+        """Keep only the state that `last` needs."""
         self._copied = self._decoder = self._h264 = None
 
     def _remember(self, sample: VideoSample) -> bool:
@@ -220,7 +220,7 @@ def _encoder(info: Info) -> VideoCodecContext:
     encoder.width, encoder.height = info.base_size
     encoder.pix_fmt = "yuv420p"
     encoder.time_base = Fraction(1, max(1, round(info.fps)))
-    # What the ground decodes, and a browser would take for something else where it is small.
+    # The colours of the ground's decoder: a browser would guess others for a small picture.
     encoder.colorspace = encoder.color_primaries = encoder.color_trc = _BT709
     encoder.color_range = ColorRange.MPEG
     encoder.options = _X264 | {"g": "100000"}  # keyframes come by capture time

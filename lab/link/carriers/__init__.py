@@ -1,1 +1,1 @@
-"""What plays a script between two processes: a relay, two network namespaces, or a tunnel."""
+"""Players of a script between two processes: a relay, two network namespaces, or a tunnel."""

@@ -1,4 +1,4 @@
-"""One direction of a link: when what is offered arrives, if it does. Pure: time comes in, chance from the seed.
+"""One direction of a link: when an offered packet arrives, if it does. Pure: time comes in, chance from the seed.
 
 The link is a server of the script's rate behind a bounded queue, then a delay line. For TCP a lost packet is not
 lost to the program: it stalls its own connection (head-of-line blocking) until it is sent again, as Linux does it:
@@ -7,7 +7,7 @@ lost to the program: it stalls its own connection (head-of-line blocking) until 
   RACK, RFC 8985), but not before the lost one is a round trip and a quarter old. So, too, where a retransmission was
   lost.
 - Where nothing later gets through, by the timer (RFC 6298): 200 ms and the round trip after it left, then doubling
-  for as long as the retransmissions are lost, too. What was lost with it is sent again one round trip later.
+  for as long as the retransmissions are lost, too. Packets lost with it are sent again one round trip later.
 
 Not modelled: the congestion window (a real TCP sends more slowly after a loss, and hardly at all after a timeout),
 the tail loss probe, and the three later packets after which the quarter is not waited for. Retransmissions and
@@ -33,7 +33,7 @@ DATAGRAM_HEADER_BYTES = 28
 """IPv4 and UDP."""
 
 _LEAST_RTO_S = 0.2
-"""What Linux adds to the round trip at least (TCP_RTO_MIN)."""
+"""Linux adds at least this to the round trip (TCP_RTO_MIN)."""
 _MOST_RTO_S = 120.0
 _OVERTAKEN_S = 0.03
 """How much later a reordered datagram comes."""
@@ -51,7 +51,7 @@ class Pipe:
     """The queue and the line of one direction, shared by all its connections.
 
     Attributes:
-        script: what the link does; may be replaced (by one that has begun).
+        script: the course of the link; may be replaced (by one that has begun).
         dropped: datagrams that found the queue full. lost: packets lost on the line.
         passed_bytes: headers included.
     """
@@ -68,7 +68,7 @@ class Pipe:
         self._queued_bytes = 0
 
     def queued_bytes(self, now_s: float) -> int:
-        """What waits for the line or is on its way onto it."""
+        """Bytes that wait for the line or are on their way onto it."""
         while self._queue and self._queue[0][0] <= now_s:
             self._queued_bytes -= self._queue.popleft()[1]
         return self._queued_bytes
@@ -95,7 +95,7 @@ class Pipe:
         return passage.departs_s + passage.delay_s + (_OVERTAKEN_S if passage.reordered else 0.0)
 
     def pass_on(self, size_bytes: int, now_s: float) -> _Passage:
-        """Take a packet onto the line behind what waits already."""
+        """Take a packet onto the line behind the waiting ones."""
         loss_draw, jitter_draw, reorder_draw = self._draw()
         departs_s = self.script.finish_s(max(now_s, self._free_s), 8 * size_bytes)
         self._free_s = departs_s
@@ -128,7 +128,7 @@ class Segment:
     """A packet of a connection. It is handed to the program when it has come and all before it were handed over."""
 
     arrives_s: float
-    """When it comes; for one that was lost, as far as is known: what is sent later may change it until then."""
+    """When it comes; for a lost packet, as far as is known: later packets may change it until then."""
 
 
 @dataclass(slots=True, eq=False)
@@ -220,7 +220,7 @@ class Stream:
         self._acknowledged(others, sent_s=first.again_s, came_s=first.segment.arrives_s)
 
     def _timer_s(self, sent_s: float) -> Iterator[float]:
-        """When what was sent then is sent again, and again, for as long as nothing is heard."""
+        """The times at which a packet sent then is sent again and again, for as long as nothing is heard."""
         wait_s = _LEAST_RTO_S + 2 * self._pipe.script.at(sent_s).delay_s
         while True:
             sent_s += wait_s

@@ -1,10 +1,10 @@
 """A bad link between two programs of one machine, for where network namespaces are not to be had.
 
 ``with Relay(script, protocol="tcp", target_port=7447) as relay:`` listens on ``relay.port`` of loopback and passes on
-to the target what `pipe` lets through, in a thread of its own. Before `Relay.begin` the link is as in the
+to the target all packets that `pipe` lets through, in a thread of its own. Before `Relay.begin` the link is as in the
 script's first moment and loses nothing. By hand: ``python -m lab.link.carriers.relay SCENARIO --target 7447``.
 
-Memory is bounded: one queue of the script's size a direction, and for each of at most 32 connections what is in
+Memory is bounded: one queue of the script's size a direction, and for each of at most 32 connections the bytes in
 flight. Where the queue is full, TCP is not read (back-pressure to the sender's socket), UDP is dropped.
 """
 
@@ -41,7 +41,7 @@ Protocol = Literal["tcp", "udp"]
 
 _MOST_CONNECTIONS = 32
 _SOCKET_BYTES = 8192
-"""Of the relay's own receiving sockets: what waits, waits where the sender notices it."""
+"""Of the relay's own receiving sockets: bytes that wait do so where the sender notices it."""
 _FLIGHT_SEGMENTS = 256
 """Of a connection: the receive window of the far end, 370 kB."""
 _FLIGHT_DATAGRAMS = 4096
@@ -136,7 +136,7 @@ class Relay:
 async def _tcp(relay: Relay, group: asyncio.TaskGroup) -> None:
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)  # inherited by what is accepted
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)  # inherited by accepted sockets
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, SEGMENT_BYTES)
     listener.setblocking(False)
     with listener:
@@ -182,7 +182,7 @@ async def _connection(relay: Relay, near: socket.socket) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Flight:
-    """What is on its way, oldest first."""
+    """Packets on their way, oldest first."""
 
     queue: asyncio.Queue[tuple[Segment, bytes]] = field(
         default_factory=lambda: asyncio.Queue(_FLIGHT_SEGMENTS)
@@ -252,7 +252,7 @@ async def _udp(relay: Relay, _group: asyncio.TaskGroup) -> None:
 
 
 class _Datagrams:
-    """Hands on what comes; every client has a socket towards the target."""
+    """Hands datagrams on; every client has a socket towards the target."""
 
     def __init__(self, relay: Relay, near: socket.socket, sockets: contextlib.ExitStack) -> None:
         self._relay = relay

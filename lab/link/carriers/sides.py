@@ -1,4 +1,4 @@
-"""Two network namespaces, one for the edge and one for the ground: what the carriers of real packets have in common.
+"""Two network namespaces, one for the edge and one for the ground: the common base of carriers of real packets.
 
 A carrier joins the two in `_build` and may let threads work (`_start`); whatever goes wrong, nothing is left behind.
 """
@@ -47,7 +47,7 @@ class Sides(ABC):
         self._worker: threading.Thread | None = None
 
     def prefix(self, side: str) -> list[str]:
-        """What goes before a command that is to run on this side (``edge`` or ``ground``)."""
+        """The words before a command that is to run on this side (``edge`` or ``ground``)."""
         return ["ip", "netns", "exec", self.names[side]]
 
     @abstractmethod
@@ -94,7 +94,7 @@ class Sides(ABC):
             subprocess.run(["ip", "netns", "delete", name], check=False, capture_output=True)
 
     def _start(self, work: Callable[[], None], *, name: str) -> None:
-        """Work in a thread until `_stop`; what it raises is raised where the sides are left."""
+        """Work in a thread until `_stop`; its exception is raised where the sides are left."""
 
         def guarded() -> None:
             try:

@@ -31,7 +31,7 @@ class Star:
         self._names = {host: f"hvt-star-{os.getpid()}-{host}" for host in everybody}
 
     def within(self, host: str) -> list[str]:
-        """What goes before a command that runs there."""
+        """The words before a command that runs there."""
         return ["ip", "netns", "exec", self._names[host]]
 
     def set_link(self, host: str, *, down: bool) -> None:

@@ -103,7 +103,7 @@ class Tunnel(Sides):
             except BlockingIOError:
                 return
             if packet[0] >> 4 != _IPV4:
-                continue  # what IPv6 says of itself on a new device is none of the script's packets
+                continue  # IPv6 announcements of a new device are none of the script's packets
             pipe.script = self._playing
             arrives_s = pipe.datagram(len(packet), time.monotonic())
             if arrives_s is not None:
@@ -111,7 +111,7 @@ class Tunnel(Sides):
 
 
 class Flight:
-    """What is on its way, by the time of its arrival; at most so many packets."""
+    """Packets on their way, by the time of arrival; their number is bounded."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -133,7 +133,7 @@ class Flight:
         return self._heap[0][0] if self._heap else float("inf")
 
     def due(self, now_s: float) -> Iterator[tuple[int, bytes]]:
-        """Take out what has arrived: where to, and the packet."""
+        """Take out arrived packets: where to, and the packet."""
         while self.next_s <= now_s:
             _, _, to, packet = heapq.heappop(self._heap)
             yield to, packet

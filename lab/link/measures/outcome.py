@@ -1,4 +1,4 @@
-"""What a run says of the link's users: numbers out of arrivals, summaries and samples, and whether bars hold."""
+"""The results of a run for the link's users: numbers from arrivals, summaries and samples, and whether bars hold."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Outcome:
     said: Mapping[str, str]
     """Standard error of both."""
     stored: StoreLeft = NOTHING_STORED
-    """What was still in the edge's store."""
+    """The rest in the edge's store."""
 
     @property
     def frames(self) -> list[Arrival]:
@@ -214,7 +214,7 @@ def _after_changes(outcome: Outcome) -> dict[str, float | None]:
         found["received in darkness, bytes"] = sum(
             one.line_bytes
             for one in outcome.frames
-            # What was on its way when it fell dark may still arrive.
+            # Messages on their way when it fell dark may still arrive.
             if any(begin + 1 < one.received_s - began_s < end for begin, end in script.dark)
         )
     return found
@@ -233,7 +233,7 @@ def _calm_again_s(outcome: Outcome, fall_s: float, *, before_s: float) -> float:
 
 
 def _rate_again_s(outcome: Outcome, rise_s: float) -> float:
-    """From the rise until two seconds together carry 90 % of what came in the mean before the fall."""
+    """From the rise until two seconds together carry 90 % of the mean before the fall."""
     step_s = 0.25
     rates = rate_over_time(outcome, every_s=step_s)
     fall_s = max(one for one in outcome.script.falls_s if one < rise_s)

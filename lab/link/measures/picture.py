@@ -1,4 +1,4 @@
-"""One picture of all runs: what the link carried and what was sent over time, and below it how old things came."""
+"""One picture of all runs: the rates of link and sender over time, and below them the ages of arrivals."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> None:
 
 
 def _rates(axes: Axes, outcome: Outcome) -> None:
-    """The link's rate, and what was sent in each second, of all that came."""
+    """The link's rate, and the bytes sent in each second, of all arrivals."""
     script, at_s = outcome.script, np.linspace(0, outcome.script.lasts_s, _SAMPLES)
     states = [script.at(float(t_s)) for t_s in at_s]
     capacity_kbps = [

@@ -45,7 +45,7 @@ class ResourceSampler:
         self._thread = threading.Thread(target=self._run, name="link-watch")
 
     def save(self, path: Path) -> None:
-        """As a table: what grew, and when."""
+        """As a table over time."""
         with path.open("w", newline="", encoding="ascii") as file:
             table = csv.writer(file)
             table.writerow(("process", "unix_s", "resident_mb", "descriptors", "threads"))
@@ -86,7 +86,7 @@ class ResourceSampler:
 def slope_mb_per_hour(samples: list[Sample]) -> float | None:
     """Of resident memory after the warm-up, by Theil and Sen; None of too few samples.
 
-    The median of the slopes between all pairs of points: what is taken for a moment (a recording that is
+    The median of the slopes between all pairs of points: memory taken for a moment (a recording that is
     compacted) or once (a library that loads late) does not bend it. Points are medians of equal parts of the time.
     """
     late = samples[int(WARM_UP * len(samples)) :]
@@ -100,11 +100,11 @@ def slope_mb_per_hour(samples: list[Sample]) -> float | None:
 
 
 def more_at_the_end(samples: list[Sample], of: Callable[[Sample], float]) -> float | None:
-    """What a run has more at its end than once it was warm; None of too few samples.
+    """The growth of a run from warm to its end; None of too few samples.
 
     Medians of twentieths of the run: the most of those in its first 40 %, and the median of those from 80 % on. So
-    a file that is open for a moment counts for nothing, nor does what an outage opens for as long as it lasts, nor
-    the socket that it has taken away: what leaks stays.
+    a file that is open for a moment counts for nothing, nor do files open for the time of an outage, nor the socket
+    that it has taken away: a leak stays.
     """
     if len(samples) < _LEAST_SAMPLES:
         return None

@@ -27,7 +27,7 @@ def row(scenario: str, measure: str, value: float | None, bar: str | None) -> di
 
 
 def holds(value: float | None, bar: str) -> bool:
-    """Whether ``value`` is as a bar such as ``<= 2`` says; what is unknown or infinite is not."""
+    """Whether ``value`` is as a bar such as ``<= 2`` says; an unknown or infinite value is not."""
     sign, limit = re.fullmatch(r"(<=|>=|==)\s*(\S+)", bar).groups()  # type: ignore[union-attr]
     if value is None or not math.isfinite(value):
         return False

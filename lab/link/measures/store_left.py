@@ -1,4 +1,4 @@
-"""What a killed edge left in its store, read as the next start of the edge would read it."""
+"""The store of a killed edge, read as the next start of the edge would read it."""
 
 from __future__ import annotations
 

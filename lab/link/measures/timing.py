@@ -1,4 +1,4 @@
-"""Reads what `hvt-ground --timing` wrote (see `hvt_ground.sinks.event_tables`)."""
+"""Reads the table of `hvt-ground --timing` (see `hvt_ground.sinks.event_tables`)."""
 
 from __future__ import annotations
 
