@@ -1,6 +1,6 @@
-"""The frame loop's contract with an encoder, its settings from a budget in line bits, and every one by its name.
+"""The frame loop's contract with an encoder, its settings from a budget in line bits, and all encoders by name.
 
-There are x265, none (passthrough), those of hardware, and those that other packages install: an entry point of the
+There are x265, none (passthrough), hardware encoders, and those that other packages install: an entry point of the
 group ``hvt.encoders`` (`MakeEncoder`), imported when it is named.
 """
 
@@ -27,12 +27,12 @@ PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
 VBV_S = 0.15
 """Depth of the VBV buffer in seconds of the base rate."""
 
-# At QP 51 the keyframes of 25 aerial pictures took at the most 0.6, 1.6, 2.5, 3.9 and 7.8 kB at 320x180, 640x360,
+# At QP 51 the keyframes of 25 aerial pictures took at most 0.6, 1.6, 2.5, 3.9 and 7.8 kB at 320x180, 640x360,
 # 960x540, 1280x720 and 1920x1080, half of them less than half of it: 770 bytes and 0.0034 a pixel. x265 can go no
-# lower, whatever the target is; where one takes more, the stage codes it again with less detail.
+# lower, whatever the target is; where a keyframe takes more, the stage codes it again with less detail.
 _KEYFRAME_FLOOR_BYTES = 770
 _KEYFRAME_FLOOR_BYTES_PER_PX = 0.0034
-# At usual thin rates keyframes take more, as far as the VBV lets them: 3.0, 3.9, 4.9 and 5.9 kB up to 1280x720.
+# At usual thin rates keyframes take more, up to the VBV's limit: 3.0, 3.9, 4.9 and 5.9 kB up to 1280x720.
 _KEYFRAME_BYTES = 2060
 _KEYFRAME_BYTES_PER_SIDE_PX = 4.0
 # The frames after a keyframe follow a target down to some 300 bits and 0.0045 bit a pixel each: 67 kbps at 1280x720
@@ -44,13 +44,13 @@ _FRAME_FLOOR_BITS_PER_PX = 0.0045
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
 _VBV_FRAMES, _TIGHT_VBV_FRAMES = 1.3, 1.15
-"""At least: with 1.15 x265 uses .8 of its rate, with 1.3 .9; with more, a window of few frames cannot hold them."""
-_TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
+"""Least depth: with 1.15 x265 uses .8 of its rate, with 1.3 .9; with more, windows of few frames cannot hold them."""
+_TIGHT_PEAK = 1.04  # of 1.05 to 1.09; the rest waits some milliseconds (budget.earliest_ns)
 _KEYFRAME_EVERY_S = 5.0
-"""x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
-x265 gets so much less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
+"""x265 never takes back the bytes of keyframes beyond a frame's share: at low rates all, at 650 kbps two thirds.
+Its rate is lowered by that: for the first keyframe, one each ten seconds, and some that grounds request."""
 _KEYFRAME_SHARE = 0.005
-"""Of the base's bytes, at most, for keyframes of the schedule."""
+"""Largest share of the base's bytes for scheduled keyframes."""
 STATUS_BYTES = 320
 """The size of a `Status`."""
 SLOWEST: Final = "veryfast"
@@ -67,7 +67,7 @@ class EncoderSettings:
     preset: str = SLOWEST
     vbv_s: float = VBV_S
     threads: int = 1
-    """Worker threads; more than one is faster, and not the same bytes each run."""
+    """Worker threads; more than one is faster, but the bytes differ from run to run."""
 
 
 def keyframe_floor_bytes(size: tuple[int, int]) -> int:
@@ -81,7 +81,7 @@ def usual_keyframe_bytes(size: tuple[int, int]) -> int:
 
 
 def most_keyframe_bytes(size: tuple[int, int], fps: float, base_bps: int) -> int:
-    """About the most that a keyframe takes: what the VBV holds at this B_v, or what x265 cannot go below."""
+    """About the largest keyframe: the VBV's content at this B_v, or the least bytes that x265 can reach."""
     return max(keyframe_floor_bytes(size), round(vbv_s(fps) * base_bps / 8))
 
 
@@ -90,14 +90,14 @@ def keyframe_interval_s(size: tuple[int, int], base_bps: int) -> float:
 
     A keyframe that the VBV lets through at a low rate is far coarser than the frames before it, and the picture takes
     seconds to recover: at 200 kbps and 1280x720 the objects found fell from 62 to 6. Grounds that join or lose
-    something request theirs anyhow; the schedule only lets a viewer jump within a recording. So its bytes
+    frames request keyframes anyhow; the schedule only lets a viewer jump within a recording. So its bytes
     are held to half a percent of the stream.
     """
     return min(60.0, max(10.0, 8 * usual_keyframe_bytes(size) / (_KEYFRAME_SHARE * base_bps)))
 
 
 def keyframe_total_bps(size: tuple[int, int], *, window_s: float, metadata_bps: int, edge_id: str) -> int:
-    """The least total of which each window holds a keyframe, with ``status``, tracks and pose beside it."""
+    """The least total at which each window holds a keyframe, with ``status``, tracks and pose beside it."""
     keyframe_bps = 8 * keyframe_floor_bytes(size) / window_s
     beside_bps = base_overhead_bps(keyframe_bps, fps=1 / window_s, edge_id=edge_id)
     return math.ceil(keyframe_bps + beside_bps + metadata_bps)
@@ -133,8 +133,8 @@ def encoder_settings(
     """Settings of x265 that keep the base stream within B_v, and its fullest second within B_tot.
 
     Where stills have a share, they yield to the base's peaks. Where video takes (nearly) the whole budget, as in M0,
-    nothing can yield: the VBV is made tighter and the target lowered by the peak that is left. Where a window of
-    ``window_s`` holds no whole number of frames, the target is lowered until it holds all that fall into it.
+    nothing can yield: the VBV is made tighter and the target lowered by the remaining peak. Where a window of
+    ``window_s`` holds no whole number of frames, the target is lowered until it holds all frames that fall into it.
 
     ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds more than one.
     """
@@ -159,7 +159,7 @@ def least_base_bps(size: tuple[int, int], fps: float, *, edge_id: str) -> int:
 
 
 def payload_bps(base_bps: int, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
-    """About what x265 gets of B_v; never below 1."""
+    """About x265's part of B_v; never below 1."""
     return max(1.0, base_bps - _beside_bps(base_bps, size=size, fps=fps, edge_id=edge_id))
 
 
@@ -178,22 +178,22 @@ def _debt_bps(size: tuple[int, int]) -> float:
 
 
 class Encoder(Protocol):
-    """Turns frames into HEVC access units, one for each, at once, and never more bits than it was opened for.
+    """Turns frames into HEVC access units, one for each, at once, and never exceeds the bits it was opened for.
 
     It is opened anew, with another `EncoderSettings`, for each change of rate, and used from one thread.
     """
 
     @property
     def mean_qp(self) -> float:
-        """Of the frame encoded last: the quantiser parameter (0…51); NaN where it is not known."""
+        """Mean quantiser parameter (0…51) of the frame encoded last; NaN where it is not known."""
         ...
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
         """The unit of ``frame.base_bgr``, uint8 (height, width, 3) BGR, not to be written to, as Annex B.
 
-        4:2:0, 8 bits, BT.709, limited range; each picture refers to earlier ones alone. With ``keyframe`` it is an
-        IDR with VPS, SPS and PPS before it, and so is the first. ``regions`` are given to x265 alone. Raises
-        whatever it likes: the frame is left out, and another encoder is opened.
+        4:2:0, 8 bits, BT.709, limited range; each picture refers only to earlier ones. With ``keyframe`` it is an
+        IDR with VPS, SPS and PPS before it, and so is the first. ``regions`` are given to x265 alone. May raise
+        any error: the frame is left out, and another encoder is opened.
         """
         ...
 
@@ -203,7 +203,7 @@ MakeEncoder = Callable[[EncoderSettings], Encoder]
 
 
 class CheckedEncoder:
-    """One that HVT has not tested itself: `ValueError` for a unit that no ground could use. Without regions."""
+    """An encoder not tested by HVT: raises `ValueError` for a unit that no ground could use. Without regions."""
 
     def __init__(self, encoder: Encoder) -> None:
         self._encoder = encoder
@@ -211,12 +211,12 @@ class CheckedEncoder:
 
     @property
     def mean_qp(self) -> float:
-        """See `Encoder`; NaN for one that says nothing, or an impossible value."""
+        """See `Encoder`; NaN where it reports none, or an impossible value."""
         said = getattr(self._encoder, "mean_qp", math.nan)
         return float(said) if isinstance(said, int | float) and 0 <= said <= 51 else math.nan
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
-        """See `Encoder`. The unit itself tells whether it is a keyframe, whatever the encoder says of it."""
+        """See `Encoder`. The unit itself shows whether it is a keyframe, whatever the encoder reports."""
         from hvt_common.video.hevc import (  # noqa: PLC0415  (the command line needs no decoder)
             is_keyframe,
             parameter_sets,
@@ -229,7 +229,7 @@ class CheckedEncoder:
         data = without_filler(data) if isinstance(data, bytes) else b""
         if not data:
             raise ValueError(f"it gave no access unit for frame {frame.index}, and has to give one for each")
-        # To begin a decoder with it takes both; another I picture is a large frame like any other.
+        # A decoder can begin only with both; another I picture is a large frame like any other.
         begins = is_keyframe(data) and bool(parameter_sets(data))
         if (keyframe or not self._begun) and not begins:
             raise ValueError(f"frame {frame.index} was to be a keyframe, and is no IDR with VPS, SPS and PPS")
@@ -237,7 +237,7 @@ class CheckedEncoder:
         return AccessUnit(frame.index, frame.capture_ns, data, keyframe=begins)
 
     def close(self) -> None:
-        """Let go of it, and so of its device and memory."""
+        """Release the encoder, and so its device and memory."""
         del self._encoder
 
 
@@ -246,25 +246,25 @@ class HardwareRow:
     """One encoder of FFmpeg."""
 
     codec: str
-    """Its name there, and of ``--encoder``."""
+    """Its name in FFmpeg, and for ``--encoder``."""
     pixel_format: str
     needs: str
     """The hardware that it needs."""
     options: Mapping[str, str] = field(default_factory=dict)
-    """Zero latency, constant rate, and an IDR where a keyframe is forced."""
+    """Options for zero latency, constant rate, and an IDR where a keyframe is forced."""
 
 
 GROUP = "hvt.encoders"
-"""The entry points' group."""
+"""The group of the entry points."""
 X265 = "x265"
 """HVT's own, measured encoder: the only one that takes regions and needs no qualification."""
 PASSTHROUGH = "passthrough"
-"""None at all: the units of a camera that makes HEVC itself."""
+"""No encoder: the units come from a camera that makes HEVC itself."""
 _WHAT = "encoder"
 
 
-# None of them has been run by the project: the rows were written from FFmpeg's documentation. What keeps a wrong row
-# from a flight is the qualification run at the start.
+# The project has run none of them: the rows were written from FFmpeg's documentation. The qualification run at the
+# start keeps a wrong row from a flight.
 _ROWS = (
     HardwareRow(
         "hevc_nvenc",
@@ -281,7 +281,7 @@ _ROWS = (
     HardwareRow("hevc_v4l2m2m", "nv12", "a board whose kernel has an HEVC encoder as a V4L2 device"),
 )
 HARDWARE: Mapping[str, HardwareRow] = MappingProxyType({row.codec: row for row in _ROWS})
-"""By name."""
+"""The rows by name."""
 _OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
 
 
@@ -291,7 +291,7 @@ def encoder_names() -> tuple[str, ...]:
 
 
 def check_encoder(name: str) -> None:
-    """Raise `UserError` where there is none of that name, or more than one; nothing is opened."""
+    """Raise `UserError` if no encoder has that name, or more than one; nothing is opened."""
     built_in = name in _OWN
     entry = the_one(GROUP, name, what=_WHAT, built_in=built_in)
     if not built_in and entry is None:
@@ -299,8 +299,8 @@ def check_encoder(name: str) -> None:
 
 
 def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
-    """Open it. Raises `UserError` where there is none, or it does not load or take the settings."""
-    # Imported for who opens one: names alone are checked at each start.
+    """Open the encoder. Raises `UserError` if there is none, or it does not load or refuses the settings."""
+    # Imported only to open one: at each start only names are checked.
     from hvt_edge.video.encoders.hardware import HardwareEncoder  # noqa: PLC0415
     from hvt_edge.video.encoders.passthrough import Passthrough  # noqa: PLC0415
     from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
@@ -319,7 +319,7 @@ def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncoderPlan:
-    """All that an encoder is opened with but rates and preset."""
+    """All settings of an encoder except rates and preset."""
 
     name: str
     size: tuple[int, int]
@@ -333,12 +333,12 @@ class EncoderPlan:
     """The share of its rate that the encoder is set to."""
 
     def open(self, rates: Rates, *, preset: str) -> Encoder:
-        """Open it at the rate that the budget leaves it. Raises `UserError` where it does not take the settings."""
+        """Open the encoder at its share of the budget. Raises `UserError` if it refuses the settings."""
         settings = encoder_settings(
             size=self.size,
             fps=self.nominal_fps / rates.decimation,
             preset=preset,
-            # What is kept for tracks may be the base's while none are sent.
+            # The rate reserved for tracks may be the base's while none are sent.
             total_bps=max(rates.total_bps - self.metadata_bps, rates.base_bps),
             base_bps=rates.base_bps,
             edge_id=self.edge_id,

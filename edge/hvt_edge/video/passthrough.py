@@ -1,7 +1,7 @@
 """The base stream where the camera has coded it itself: an encoder that cannot make keyframes.
 
-A unit builds on the one before it. So where one is not sent, for want of room in the budget's window or on the link,
-all that follow are left out up to the camera's next keyframe: nobody could show them. Nothing is asked of the camera.
+A unit builds on the one before it. So if one is not sent, for want of room in the budget's window or on the link,
+all units up to the camera's next keyframe are left out: no ground could show them. The camera is never commanded.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from hvt_edge.video.stage import Action, BaseStage, FrameDecision, FrameInputs, 
 
 _PART = "passthrough"
 _PATIENCE_NS = SECOND_NS // 2
-"""A unit waits so long for its room: a large keyframe leaves none for a moment, and a waiting unit is not lost."""
+"""Longest wait of a unit for room: a large keyframe leaves none for a moment, and a waiting unit is not lost."""
 _POLL_NS = SECOND_NS // 100
 
 
 @dataclass(eq=False)
 class PassthroughStage(BaseStage):
-    """A `BaseStage` whose frames are due and are keyframes as the camera's units are.
+    """A `BaseStage` whose frames are due, and are keyframes, as the camera's units are.
 
-    ``pause(ns)`` sleeps and returns the time; None in lockstep, where nothing is waited for. ``rates`` see each unit,
-    and change before it is asked whether a keyframe may go to the link, so that another budget holds from there on:
-    one that was lowered too far could never be raised again. ``least_link`` holds a keyframe that follows a break.
-    ``local_copy`` has all that the camera gave, sent or not.
+    ``pause(ns)`` sleeps and returns the time; None in lockstep, where nothing is waited for. ``rates`` note each
+    unit, and change before a keyframe's room on the link is checked, so that another budget takes effect there: a
+    budget lowered too far could otherwise never be raised again. ``least_link`` holds a keyframe that follows a
+    break. ``local_copy`` has all units of the camera, sent or not.
     """
 
     rates: CameraRates | None = None
@@ -39,10 +39,10 @@ class PassthroughStage(BaseStage):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._sent_index = self._stored_index = self._copied_index = -2
-        """The frames sent last, stored last, copied last."""
+        """Indices of the frames sent last, stored last, copied last."""
         self._paused_ns = 0
         self._held_by: FrameGroup = "unreadable"
-        """Why the chain of units is broken: up to the next keyframe that is sent, for that none can be shown."""
+        """Why the chain of units is broken: until the next keyframe is sent, no unit can be shown."""
         self.left_out = 0
         """Units that were neither sent nor stored."""
 
@@ -75,7 +75,7 @@ class PassthroughStage(BaseStage):
             return FrameDecision(Action.HOLD, held_by=self._held_by)
         if keyframe:
             self.failures.works(_PART)
-        return replace(decision, meets_plan=keyframe)  # the camera's next one will do
+        return replace(decision, meets_plan=keyframe)  # the camera's next keyframe will do
 
     def encode(
         self, frame: Frame, decision: FrameDecision, *, now_ns: int, tracks: Tracks | None = None
@@ -89,12 +89,12 @@ class PassthroughStage(BaseStage):
             self._stored_index = unit.frame_index
         else:
             self._sent_index = unit.frame_index
-        self._held_by = "unreadable"  # what does not come next was lost before
+        self._held_by = "unreadable"  # a gap in the numbers: frames between were lost before they came here
         return unit
 
     @property
     def budget_waited_ns(self) -> int:
-        """See `BaseStage`; the waits before a decision too."""
+        """See `BaseStage`; includes the waits before a decision."""
         return self._paused_ns + super().budget_waited_ns
 
     def _note_sent(self, unit: AccessUnit, line_bytes: int, *, now_ns: int) -> None:
@@ -107,14 +107,14 @@ class PassthroughStage(BaseStage):
         self._note_left_out(unit)
 
     def _admitted(self, unit: AccessUnit, now_ns: int, *, live: bool) -> bool:
-        # Whether it may go now; where the link is ``live``, or a moment later.
+        # Whether the unit may be sent now; where the link is ``live``, now or a moment later.
         until_ns = now_ns + (_PATIENCE_NS if live else 0)
         begins = live and self._sent_index != unit.frame_index - 1
         while True:
             wait_ns = self.transmitter.base_unit_wait_ns(unit, now_ns=now_ns)
             in_time = wait_ns is not None and now_ns + wait_ns <= until_ns
             free = not begins or self.least_link is None or self.least_link.is_free(now_ns)
-            # The link is always asked: what is lost is given up there.
+            # The link is always queried: there lost messages are given up.
             admitted = self.admits(now_ns, round(self.transmitter.budget.base_step_bytes), 0)
             if admitted and in_time and free:
                 return True

@@ -2,12 +2,12 @@
 
 Fewer frames get more bits each. Measured on a still and on a fast moving camera from 100 to 400 kbps
 (docs/base-stream.md), F1 and class agreement of tracks rise down to three to five frames a second wherever x265 needs
-a mean quantiser above about 32, provided that what lies between two frames is predicted from both. Smaller pictures
+a mean quantiser above about 32, provided that positions between two frames are predicted from both. Smaller pictures
 lose more objects than their bits win, so the size falls last.
 
-`FrameSkip` chooses the source frames to code: each n-th, with ``--fps auto`` by an n from the quantiser that x265
-needs at the given rate, held in a band; `PresetControl` x265's preset by the time that it takes. Both change at
-keyframes only, because the encoder is opened anew for it.
+`FrameSkip` chooses the source frames to code: each n-th, and with ``--fps auto`` n follows from the quantiser that
+x265 needs at the given rate, held in a band; `PresetControl` chooses x265's preset by its processor time. Both change
+at keyframes only, because the encoder is opened anew for it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 SIZES = ((1280, 720), (960, 540), (640, 360), (480, 270), (320, 180))
 """The ladder of ``--size auto`` for a source of 16:9; others keep its areas and their own aspect ratio. It ends where
-x265 still codes 15 frames a second on two cores; ``--size`` may ask for more."""
+x265 still codes 15 frames a second on two cores; ``--size`` may be larger."""
 
 _STEPS = (1, 2, 3, 5, 8, 15)
 """The ladder of n: each n-th source frame is coded."""
@@ -36,19 +36,19 @@ _LEAST_FPS = 2.0
 """A budget's window of a second holds two frames at least (see config)."""
 
 LEAST_SIDE_PX = 64
-# Bits for each pixel of a coded frame: from where a size is worth its pixels, and a frame its place.
+# Bits for each pixel of a coded frame: the least at which a size is worth its pixels, and at which a frame is coded.
 _SIZE_BITS_PER_PX = 0.020
 _RATE_BITS_PER_PX = 0.040
 
 _COST: Final = {"ultrafast": 0.63, "superfast": 0.77, SLOWEST: 1.0}
-"""Processor time against that of the slowest: .58 to .69 and .74 to .79 on two clips at 300 and 800 kbps."""
+"""Processor time relative to the slowest: .58 to .69 and .74 to .79 on two clips at 300 and 800 kbps."""
 _LEAST_CORES: Final = 0.4
 _SHARE: Final = 0.2
 _PLAINLY: Final = 1.15
 _WINDOW_NS: Final = 30 * SECOND_NS
 
 Spent = Callable[[], tuple[int, int]]
-"""(processor time in nanoseconds, frames) of the encoder that runs, since it was opened."""
+"""(processor time in nanoseconds, frames) of the running encoder, since it was opened."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +64,12 @@ class QuantiserBand:
 
 
 SPARING = QuantiserBand(fine=25.0, coarse=32.0, far=36.0)
-"""For whoever asks for the frame rate that shows most, whatever the delay. 7 wide: a step of the ladder moved the
+"""For users who want the frame rate that shows most, whatever the delay. 7 wide: a step of the ladder moved the
 quantiser by 1 to 2.5, two together by 4 at most, so that the choice settles."""
 PROMPT = QuantiserBand(fine=28.0, coarse=33.5, far=51.0)
-"""Between 15 and 7.5 frames a second, for whoever wants pictures early too. Measured at 200 and 300 kbps on drawn
-scenes and on pictures under a virtual camera (docs/design-notes/auto.md): 7.5 named more where 15 needed 34 and more,
-and less where 15 needed 30."""
+"""Between 15 and 7.5 frames a second, for users who want pictures early too. Measured at 200 and 300 kbps on drawn
+scenes and on pictures under a virtual camera (docs/design-notes/auto.md): 7.5 named more objects where 15 needed 34
+and more, and fewer where 15 needed 30."""
 
 
 def choose_base(
@@ -83,15 +83,15 @@ def choose_base(
 ) -> tuple[tuple[int, int], int]:
     """The base stream's (width, height), and n where each n-th frame of ``most_fps`` is coded.
 
-    ``payload_bps`` is what x265 gets, without headers of any transport. ``size`` and ``fps`` are what the user
-    sets, None for ``auto``: then the base is never larger than the source, and no slower than ``least_fps``. A set
-    ``fps`` codes each source frame, so n is 1. Raises `UserError` where the source is too small for any base
+    ``payload_bps`` is x265's rate, without headers of any transport. ``size`` and ``fps`` are the user's
+    settings, None for ``auto``: then the base is never larger than the source, and no slower than ``least_fps``. A
+    set ``fps`` codes each source frame, so n is 1. Raises `UserError` where the source is too small for any base
     stream.
     """
     nominal_fps = most_fps if fps is None else fps
     most_n = 1 if fps is not None else most_decimation(most_fps, least_fps=least_fps)
     if size is None:
-        # The rate at the lowest frame rate that is wanted: what the size costs can be had back in frames.
+        # The rate at the lowest frame rate that is wanted: fewer frames can pay for a larger size.
         size = _size_for(payload_bps / nominal_fps * min(most_n, 3), source_size)
     bits_per_px = payload_bps / nominal_fps / (size[0] * size[1])
     fitting = [n for n in _STEPS if n <= most_n and bits_per_px * n >= _RATE_BITS_PER_PX]
@@ -101,7 +101,7 @@ def choose_base(
 def better_decimation(
     decimation: int, *, mean_qp: float, most_decimation: int, band: QuantiserBand = SPARING
 ) -> int:
-    """One step of the ladder, or two, towards the band in which frames are worth their bits."""
+    """The n one step of the ladder, or two, nearer to the band in which frames are worth their bits."""
     steps = [n for n in _STEPS if n <= most_decimation]
     at = max((index for index, n in enumerate(steps) if n <= decimation), default=0)
     if mean_qp > band.coarse:
@@ -117,7 +117,7 @@ def most_decimation(fps: float, *, least_fps: float = _LEAST_FPS) -> int:
 
 
 def _size_for(bits_per_frame: float, source_size: tuple[int, int]) -> tuple[int, int]:
-    # The largest of the ladder that the bits of a frame fill; the smallest where none is.
+    # The largest of the ladder that the bits of a frame fill; the smallest where they fill none.
     sizes = sizes_of(source_size)
     fitting = [size for size in sizes if bits_per_frame / (size[0] * size[1]) >= _SIZE_BITS_PER_PX]
     return fitting[0] if fitting else sizes[-1]
@@ -143,15 +143,15 @@ def sizes_of(source_size: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 class FrameSkip:
-    """Each ``decimation``-th source frame. Where one was missed, the next is coded in its place.
+    """Codes each ``decimation``-th source frame. Where one was missed, the next is coded in its place.
 
-    No more frames than ``least_decimation()`` allows at the time of a keyframe.
+    It codes no more frames than ``least_decimation()`` allows at the time of a keyframe.
     """
 
     def __init__(self, decimation: int = 1, *, least_decimation: Callable[[], int] = lambda: 1) -> None:
         assert decimation >= 1
         self.decimation = self._wanted = decimation
-        """Changed by `at_keyframe` only; and what it would be without the limit."""
+        """The n in force, changed by `at_keyframe` only; ``_wanted`` is n without the limit."""
         self._least_decimation = least_decimation
         self._next: int | None = None
 
@@ -160,7 +160,7 @@ class FrameSkip:
         return self._next is None or index >= self._next
 
     def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
-        """This frame was coded. After a keyframe, which may come at any index, the count starts anew."""
+        """Note that this frame was coded. After a keyframe, which may come at any index, the count starts anew."""
         del mean_qp
         if self._next is None or keyframe:
             self._next = index + self.decimation
@@ -185,8 +185,8 @@ class FrameSkip:
 class MeasuredFrameSkip(FrameSkip):
     """``--fps auto``: decided anew at keyframes, from the mean quantiser of the newest ``window_frames``.
 
-    With ``own_keyframes`` more frames are worth one; fewer wait for a keyframe that comes anyway. All of it depends
-    on the coded frames alone, so that in lockstep the same input gives the same bytes.
+    With ``own_keyframes`` an increase of frames gets a keyframe of its own; a decrease waits for the next one. The
+    decision depends on the coded frames alone, so that in lockstep the same input gives the same bytes.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ class MeasuredFrameSkip(FrameSkip):
         """(index, mean quantiser) of the newest frames."""
 
     def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
-        """See `FrameSkip`. Keyframes are coarser by nature and tell nothing."""
+        """See `FrameSkip`. Keyframes are coarser by nature and do not count."""
         super().coded(index, keyframe=keyframe, mean_qp=mean_qp)
         if self._decided_index is None:
             self._decided_index = index
@@ -247,16 +247,16 @@ class PresetChoice:
 
     preset: str = SLOWEST
     says: str = ""
-    """One line for people; empty for the slowest, and for one that the user has chosen."""
+    """A line for the user; empty for the slowest, and for a preset that the user has chosen."""
 
 
 def share_of(cores: float) -> float:
-    """Processors, of so many, that encoding may take."""
+    """Cores that encoding may take, of ``cores``."""
     return max(min(_LEAST_CORES, cores / 2), _SHARE * cores)
 
 
 def choose_preset(slowest_cores: float, *, most_cores: float) -> PresetChoice:
-    """The slowest preset within ``most_cores``, where `SLOWEST` would take so much; else the fastest."""
+    """The slowest preset within ``most_cores``, if `SLOWEST` takes ``slowest_cores``; else the fastest."""
     within = [one for one, cost in _COST.items() if slowest_cores * cost <= most_cores]
     preset = within[-1] if within else next(iter(_COST))
     if preset == SLOWEST:
@@ -268,11 +268,11 @@ def choose_preset(slowest_cores: float, *, most_cores: float) -> PresetChoice:
 class PresetControl:
     """Decides at keyframes whether x265 is to be opened with another preset; sets ``operating.now.preset``.
 
-    It is the slowest for which the machine has time, measured and not guessed: encoding is to take at most `share_of`
-    the processors at the full rate of coded frames, by the processor time that it takes and not by the clock: what
-    waits behind others takes none. What another preset would take follows from the one that runs by `_COST`. It steps
-    only where half a minute in the mean says so plainly.
-    Whoever opens an encoder says how to ask it what it takes (`watch`). Time is an argument.
+    It is the slowest for which the machine has time, by measurement: encoding is to take at most `share_of`
+    the processors at the full rate of coded frames, in processor time and not by the clock, because a frame that
+    waits behind other work takes none. The cost of another preset follows from the running one by `_COST`. It steps
+    only where the mean over half a minute shows plainly that it should.
+    The opener of an encoder passes a function that returns its cost (`watch`). Time is an argument.
     """
 
     def __init__(self, operating: Operating, *, nominal_fps: float, most_cores: float) -> None:
@@ -281,16 +281,16 @@ class PresetControl:
         self._spent: Spent = lambda: (0, 0)
         self._before = (0, 0)
         self._total = (0, 0)
-        """Of this window, in encoders that are closed."""
+        """Cost in this window of encoders that are closed."""
         self._since_ns: int | None = None
 
     def watch(self, spent: Spent) -> None:
-        """Another encoder codes from now on, with the preset that is in force."""
+        """Measure another encoder from now on, which runs with the preset that is in force."""
         self._total = self._in_window()
         self._spent, self._before = spent, spent()
 
     def wants_another(self, now_ns: int) -> bool:
-        """Whether the encoder is to be opened anew with the preset that this sets; call it at each keyframe."""
+        """Whether the encoder is to be opened anew with the preset that this call sets; called at each keyframe."""
         if self._since_ns is None:
             self._begin(now_ns)
         assert self._since_ns is not None, "set above"

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
 _WORTH = 0.04
-"""At a keyframe that comes anyway, a base rate that is off by less is left as it is."""
+"""At a keyframe that is due anyway, a base rate off by less than this stays as it is."""
 
 OpenEncoder = Callable[[Rates], Encoder]
 """Opens the encoder for these rates."""
@@ -88,14 +88,14 @@ class EncoderReconfiguration:
         self._least_base_bps = least_base_bps(self.size, self.least_fps, edge_id=self.edge_id)
         now = self.operating.now
         self._opened = Rates(now.budget_bps, now.base_bps, now.decimation)
-        """For which x265 was last opened."""
+        """The rates for which x265 was last opened."""
         self._commanded = (now.budget_bps, now.video_share)
         """Budget and share that x265 was last opened under."""
         self.count = 0
         """How often x265 was opened anew."""
 
     def track_link(self, now_ns: int) -> bool:
-        """Hold the budget to the link's rate; True where the base should be opened anew: a keyframe is wanted."""
+        """Hold the budget to the link's rate; True where the base should be opened anew, which needs a keyframe."""
         if self.pacer is None:
             return False
         self._allow(self.pacer.rate_bps, now_ns)
@@ -105,7 +105,7 @@ class EncoderReconfiguration:
         )
 
     def hold(self, now_ns: int) -> None:
-        """While the link is offline: what is stored has the budget that the base stream was opened for.
+        """While the link is offline: stored messages have the budget for which the base stream was opened.
 
         The pacer takes the silence for a link that carries next to nothing; stills would find no room in the store.
         """
@@ -115,7 +115,7 @@ class EncoderReconfiguration:
         self._allow(min(self._commanded[0], round(now.base_bps / self._share)), now_ns)
 
     def least_decimation(self) -> int:
-        """At the link's rate, each n-th source frame at the most can be coded: x265 has a least for each frame."""
+        """The least n at the link's rate, where each n-th source frame is coded: x265 needs some bits for each."""
         if self.pacer is None:
             return 1
         base_bps = self._base_of(self.pacer.steady_bps)
@@ -126,7 +126,7 @@ class EncoderReconfiguration:
         return most
 
     def keyframe_bytes(self, last_bytes: int) -> int:
-        """About the line bytes of the next keyframe, where the last one took so many.
+        """About the line bytes of the next keyframe, if the last one took ``last_bytes``.
 
         At a lower rate, for which the encoder is opened with it, its VBV lets less through.
         """
@@ -142,7 +142,7 @@ class EncoderReconfiguration:
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether rates are so far off that it is worth a keyframe of its own; once a second."""
         now = self.operating.now
-        if self._commanded != (now.budget_bps, now.video_share):  # it came while a keyframe was being made
+        if self._commanded != (now.budget_bps, now.video_share):  # commanded while a keyframe was being made
             return True
         if self.split is None or not self._moving:
             return False
@@ -155,7 +155,7 @@ class EncoderReconfiguration:
         return self.open_encoder(self._opened)
 
     def __call__(self, decimation: int, now_ns: int) -> Encoder | None:
-        """Return the encoder to go on with from this keyframe, or None for the one there is."""
+        """Return the encoder from this keyframe on, or None to keep the present one."""
         changed = self._take_command()
         same_preset = self.presets is None or not self.presets.wants_another(now_ns)
         if self.pacer is not None:
@@ -202,7 +202,7 @@ class EncoderReconfiguration:
         self.budget.set_total(now.total_bps, now.base_bps, fps, now_ns=now_ns)
 
     def _base_of(self, total_bps: int) -> int:
-        # The base's part of so much in all; never less than x265 can follow at its lowest frame rate.
+        # The base's part of this total; never less than x265 can follow at its lowest frame rate.
         return max(
             self._least_base_bps, base_rate_bps(total_bps, self._share, metadata_bps=self._metadata_bps)
         )
@@ -220,7 +220,7 @@ class EncoderReconfiguration:
 
     @property
     def _moving(self) -> bool:
-        # Whether the split tracks the scene: another method may want none.
+        # Whether the split tracks the scene; a commanded share stops it.
         return self._commanded[1] is None
 
     def _take_command(self) -> bool:
@@ -251,7 +251,7 @@ class EncoderReconfiguration:
 
 @dataclass(eq=False)
 class Split:
-    """Watches decision steps, which may come from another thread, and proposes a share at keyframes.
+    """Observes decision steps, which may come from another thread, and proposes a share at keyframes.
 
     Rates are in line bits a second.
     """
@@ -261,32 +261,32 @@ class Split:
     least_base_bps: int
     """The lowest B_v at which x265 follows its target (`rate.least_base_bps`)."""
     metadata_bps: int = 0
-    """The rate of the ``tracks`` channel: neither the base's nor the stills'."""
+    """The rate of the ``tracks`` channel: part of neither the base's share nor the stills'."""
     visible_base_bps: int = 160_000
     """Below it the base loses objects that it would else show, more than stills give back (1280x720 at 15 fps)."""
     least_still_share: float = 0.05
-    """For newcomers, and for stills that a ground asks for."""
+    """Least share of stills, for new tracks and for stills that a ground requests."""
     most_still_share: float = 0.35
     most_sparse_share: float = 1.0
-    """For the base, while not all frames are coded: each takes the longer on the line the more bits it has."""
+    """Most of the base while not all frames are coded: each takes the longer on the line the more bits it has."""
     horizon_s: float = 5.0
-    """The need that waits is to be worked off in so long."""
+    """Time in which the waiting need is to be worked off."""
     full_gain: float = 0.3
     """A track with this expected gain (M6) counts as one whole still; one with less as a part of it."""
     memory_s: float = 3.0
     """Time constant with which the need is averaged."""
     least_change: float = 0.05
-    """Of the budget; a smaller change is not worth the opening of an encoder."""
+    """Least change, as a share of the budget; a smaller one is not worth the opening of an encoder."""
     own_change: float = 0.1
-    """Of the budget; a share that is off by so much is worth a keyframe of its own."""
+    """Change, as a share of the budget, that is worth a keyframe of its own."""
     own_rest_s: float = 20.0
-    """The least time between two of these, and before the first: a keyframe on a thin link is seen for seconds."""
+    """The least time between two of these, and before the first: a keyframe on a thin link is visible for seconds."""
     share: float = FIRST_SHARE
     """The base's share of the budget: the first, then the one last proposed."""
 
     def __post_init__(self) -> None:
         self.lock = threading.RLock()
-        """Held by whoever says something and asks for the share that follows."""
+        """Held by a caller that sets values and reads the share that follows."""
         self._gain = ExpectedGain()
         self._stills, self._sparse = True, False
         self._need_bytes = 0.0
@@ -296,7 +296,7 @@ class Split:
         """The time of the last change of the share."""
 
     def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
-        """Take in all tracks of a decision step, those that rest included."""
+        """Observe all tracks of a decision step, resting ones included."""
         need_bytes = sum(self._need(one, step) for one in candidates)
         doubts = [self._gain.doubt(one, from_source=step.from_source) for one in candidates]
         shown = 1 - sum(doubts) / len(doubts) if doubts else 1.0
@@ -311,7 +311,7 @@ class Split:
             self._observed_ns = step.now_ns
 
     def set_total(self, total_bps: int) -> None:
-        """Another budget from now on; the share stays as it is, unless x265 could not follow it any more."""
+        """Set another budget; the share stays as it is, unless x265 could not follow it any more."""
         self.total_bps = total_bps
         self.share = max(self.share, min(1.0, self.least_base_bps / total_bps))
 
@@ -334,7 +334,7 @@ class Split:
         return share
 
     def wants_keyframe(self, now_ns: int) -> bool:
-        """Whether the scene has changed so much that the split should not wait for the next keyframe that comes."""
+        """Whether the scene has changed so much that the split should not wait for the next keyframe."""
         if self._observed_ns is None or now_ns - self._changed_ns < self.own_rest_s * 1e9:
             return False
         return abs(self._target() - self.share) >= self.own_change - 1e-9
@@ -358,7 +358,7 @@ class Split:
         return max(0.0, min(wanted, 1 - self._metadata_share() - self._floor_bps() / self.total_bps))
 
     def _floor_bps(self) -> float:
-        # The least for the base: more, the more of the objects it shows by itself.
+        # The least for the base: the more of the objects it shows by itself, the higher.
         least = self.least_base_bps
         return least + self._shown * max(0, self.visible_base_bps - least)
 

@@ -1,4 +1,4 @@
-"""One frame of the base stream: gather what the decision depends on, decide, encode, store or send."""
+"""One frame of the base stream: gather the inputs of the decision, decide, encode, store or send."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Action(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameInputs:
-    """All that the decision depends on."""
+    """All inputs of the decision."""
 
     due: bool
     """Frame decimation takes this source frame."""
     keyframe_due: bool
-    """The plan wants its keyframe now: one is due, and it fits the budget's window or has waited long enough."""
+    """The plan's keyframe is due, and it fits the budget's window or has waited long enough."""
     admitted: bool
     """Pacer and budget have room for a frame now, and no keyframe that a ground waits for needs it."""
     yielded: bool = False
@@ -47,7 +47,7 @@ class FrameInputs:
     link: State = State.LIVE
     """Always LIVE where there is no store."""
     segment_due: bool = False
-    """The store needs a keyframe to begin its next segment with."""
+    """The store needs a keyframe to begin its next segment."""
     probe_due: bool = False
     """The link is silent and it is time to send a frame that may show whether it is back."""
 
@@ -63,9 +63,9 @@ class FrameDecision:
     meets_plan: bool = False
     """This keyframe is the one that the plan waits for."""
     resumes: bool = False
-    """With it the link has the stream again."""
+    """With this frame the link gets the stream again."""
     held_by: FrameGroup = "budget"
-    """For HOLD: the owner without room."""
+    """For HOLD: the part that has no room."""
 
     @property
     def codes(self) -> bool:
@@ -73,7 +73,7 @@ class FrameDecision:
 
     @property
     def reconfigures(self) -> bool:
-        """Whether rates may change with it: at a keyframe for the link. The store goes on at the rate there was."""
+        """Whether rates may change with it: at a keyframe for the link. The store continues at the former rate."""
         return self.keyframe and not self.to_store
 
 
@@ -101,7 +101,7 @@ def decide(inputs: FrameInputs) -> FrameDecision:
     | RETURNING | no | yes | | no | code, to the store |
     | RETURNING | no | | | yes | keyframe to the store; the plan still waits for its own |
 
-    OFFLINE, a coded frame also goes to the link as a probe, where one is due and admitted. LIVE, a frame that is no
+    OFFLINE, a coded frame also goes to the link as a probe, if one is due and admitted. LIVE, a frame that is no
     keyframe is held too where a requested still needs its bytes.
     """
     if inputs.link is State.LIVE:
@@ -124,10 +124,10 @@ def decide(inputs: FrameInputs) -> FrameDecision:
 _PART, _SIZE_PART = "encoder", "video"
 _MOST_FAILURES, _FAILURES_NS = 3, 10 * SECOND_NS
 _CODING_MEMORY = 4
-"""Over about so many frames it is averaged how long coding takes."""
+"""Number of frames over which the coding time is averaged."""
 _COARSER = (2, 4, 8)
-"""By how much a picture is made coarser whose unit is too large. x265 cannot code more coarsely than at quantiser 51;
-what it has to code can have less detail."""
+"""Factors by which a picture is coarsened if its unit is too large. x265 cannot code more coarsely than at quantiser
+51, but its input can have less detail."""
 
 
 class LocalCopy(Protocol):
@@ -144,9 +144,9 @@ class BaseStage:
 
     ``first_keyframe_bytes`` is the guess until a keyframe has been coded. ``reconfigure(decimation, now_ns)`` runs
     before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
-    takes neither another frame rate nor another bit rate once it is open. ``keyframe_bytes(last_bytes)`` says about
-    how many line bytes that keyframe takes, ``admits(now_ns, line_bytes, coding_ns)`` whether pacer and budget have
-    room for so many once it is coded, ``holder(now_ns)`` which of them has none. ``open_again()`` gives another
+    takes neither another frame rate nor another bit rate once it is open. ``keyframe_bytes(last_bytes)`` estimates
+    that keyframe's line bytes, ``admits(now_ns, line_bytes, coding_ns)`` tells whether pacer and budget have
+    room for them once it is coded, ``holder(now_ns)`` which of the two has none. ``open_again()`` returns another
     encoder for one that has failed; without it, as in lockstep, the failure is raised.
     """
 
@@ -172,7 +172,7 @@ class BaseStage:
         self._frame_skip = self.frame_skip or FrameSkip()
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
         self._coding_began_ns = self._coding_ns = 0
-        """When the newest frame came to the encoder, and how long frames take there of late."""
+        """When the newest frame came to the encoder, and the recent mean of the coding time."""
         self._begins_anew = False
         """The encoder was opened again, or a frame that others build on was left out: the next is a keyframe."""
 
@@ -181,14 +181,14 @@ class BaseStage:
         keyframe_bytes = self.keyframe_bytes(self._keyframe_bytes)
         awaited, budget = self.keyframes.awaited, self.transmitter.budget
         fits = budget.keyframe_fits(keyframe_bytes, now_ns=now_ns, awaited=awaited)
-        if not self.keyframes.requested:  # one of the schedule: a requested still goes before it
+        if not self.keyframes.requested:  # a scheduled keyframe: a requested still goes before it
             fits = fits and not budget.yielding(now_ns)
         backlog, frame_bytes = self.backlog, round(budget.base_step_bytes)
         link = State.LIVE if backlog is None else backlog.state
         keyframe_due = self.keyframes.now(now_ns, fits=fits) or self._begins_anew
         if (
             link is State.LIVE and self.reconfigure is not None
-        ):  # only at another rate is there one that can go
+        ):  # a frame that fits no window needs another rate
             keyframe_due = keyframe_due or not budget.holds(frame_bytes)
         line_bytes = keyframe_bytes if keyframe_due else frame_bytes
         yields_to_keyframe = awaited and link is State.LIVE and not keyframe_due
@@ -215,8 +215,8 @@ class BaseStage:
     ) -> AccessUnit | None:
         """Encode the frame as decided (None where it is not coded); ``tracks`` are the newest known.
 
-        A frame on which the encoder fails is left out. `FlightError` where it fails again and again. One that no
-        window of the budget has room for is coded again, as a keyframe of less and less detail.
+        A frame on which the encoder fails is left out. Raises `FlightError` if it fails repeatedly. A frame for which
+        no window of the budget has room is coded again, as a keyframe of less and less detail.
         """
         if not decision.codes:
             return None
@@ -247,24 +247,24 @@ class BaseStage:
 
     @property
     def budget_waited_ns(self) -> int:
-        """The time that frames have waited for the budget's window, all together."""
+        """The total time for which frames have waited for the budget's window."""
         return self.transmitter.base_waited_ns
 
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> bool:
         """Store the unit, or send it, or both; blocks while the link is full: frames are dropped before encoding.
 
-        False where the store did not take it, or nothing has room for it on the link.
+        False where the store did not take it, or the link has no room for it.
         """
         taken_ns = now_ns - self._coding_began_ns
         self._coding_ns += (taken_ns - self._coding_ns) // (_CODING_MEMORY if self._coding_ns else 1)
         if self.backlog is not None and decision.to_store:
             taken = self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
-            if decision.to_link:  # a probe; what it builds on was not sent
+            if decision.to_link:  # a probe; earlier frames that it builds on were not sent
                 announced = self.keyframes.made_here
                 self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe, announced=announced)
             elif self.backlog.offline:
                 self.transmitter.store_base(unit, now_ns=now_ns)
-            # On the way back none of it is on the line: the budget has to get room for the keyframe to go on with.
+            # On the way back no stored frame is on the line: the budget needs room for the keyframe that resumes.
             return taken or decision.to_link
         line_bytes = self.transmitter.base(unit, now_ns=now_ns, announced=self.keyframes.made_here)
         if not line_bytes:
@@ -278,8 +278,8 @@ class BaseStage:
         return self._frame_skip.wants_keyframe(index)
 
     def _within_a_window(self, unit: AccessUnit, frame: Frame, *, now_ns: int, may_open: bool) -> AccessUnit:
-        # The unit, or a keyframe of the same picture for which a window has room: at the rate of now, since at that
-        # of before x265 fills its VBV with any picture, and then with less and less detail.
+        # The unit, or a keyframe of the same picture for which a window has room: first at the present rate, since at
+        # the former one x265 fills its VBV with any picture, and then with less and less detail.
         if may_open and not unit.keyframe and not self.transmitter.holds(unit):
             self._at_keyframe(frame.index, now_ns=now_ns)
             unit = self.encoder.encode(frame, keyframe=True, regions=[])
@@ -306,7 +306,7 @@ class BaseStage:
             self.keyframes.note_cost(8 * SECOND_NS * line_bytes // self.transmitter.budget.total_bps)
 
     def _leave_out(self, unit: AccessUnit) -> None:
-        # Nothing has room for it: what follows cannot be shown before another keyframe.
+        # No window has room for it: later frames cannot be shown before another keyframe.
         self._begins_anew = True
         what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
         total = bitrate_text(self.transmitter.budget.total_bps)

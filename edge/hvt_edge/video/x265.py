@@ -5,18 +5,18 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
 * A VBV of 0.15 s keeps the run within 1.02 and each rolling second within 1.14 of the target from 300 kbps up,
   on-demand keyframes included; with 0.2 s a keyframe on demand reaches 1.18. x265 leaves up to 40 % of the rate
   unused after a keyframe of a still scene (``strict-cbr`` only fills that up with filler): `SpareRate` uses it.
-* ``keyint=-1``: no keyframe comes by itself. The edge asks for each one, so that stills can yield to it. x265 is
-  opened anew for it, in 2 ms: it never forgets what earlier scenes took, and its keyframe of a still one had QP 51.
+* ``keyint=-1``: no keyframe comes by itself. The edge requests each one, so that stills can yield to it. x265 is
+  opened anew for it, in 2 ms: an open x265 never forgets the cost of earlier scenes, and gave a still one QP 51.
 * ``pools``: with several worker threads the row-level rate control sees a different order of rows each run, and the
-  same input gives other bytes. Lockstep therefore uses one; real time uses what there is, which halves the time of a
+  same input gives other bytes. Lockstep therefore uses one; real time uses all cores, which halves the time of a
   frame on two cores (keyframes 151 to 81 ms, others 23 to 13).
 * x265's workers lower their own priority by 10, to that of perception: a frame then takes twice as long wherever a
-  network runs beside it. They are given back that of the frame loop, where the process may do that.
+  network runs beside it. They get the frame loop's priority back, if the process has the right to raise it.
 * ``open-gop=0`` makes a forced I frame an IDR, but within ``min-keyint`` of the last one (a second, by default) it
-  stays a plain I frame that nobody can start at; ``repeat-headers=1`` puts the parameter sets before an IDR.
+  stays a plain I frame at which no decoder can start; ``repeat-headers=1`` puts the parameter sets before an IDR.
 * ``info=0``: else each keyframe carries x265's settings as text, 2.4 kB.
 * BT.709 limited range, signalled: viewers assume it for HD.
-* Each picture carries regions of interest (`RegionTagger`). An offset of 0 changes no byte, but in the two fastest
+* Each picture carries regions of interest (`RegionTagger`). An offset of 0 changes no byte, except in the two fastest
   presets.
 """
 
@@ -48,7 +48,7 @@ from hvt_edge.video.encoder import EncoderSettings
 BLOCK_PX = 16
 """libx265 keeps one offset for each block of 16x16 luma pixels; a region takes all blocks that it touches."""
 MOST_REGIONS = 96
-"""More are not attached: the deepest come first."""
+"""Further regions are not attached: the deepest come first."""
 
 _LEAST_SIDE_PX = 1
 
@@ -67,23 +67,23 @@ class RegionTagger:
     """Attaches regions to the pictures of one stream, which have one size and one format.
 
     libx265 takes them as side data of the picture. PyAV has no setter for it, but libavfilter's ``addroi`` attaches
-    it while a picture passes through. To build that takes 0.4 ms for 30 regions; it is kept while they stay the same.
+    it while a picture passes through. Building the filter takes 0.4 ms for 30 regions; it is reused while they stay.
 
     Two things are easily got wrong. x265 decides at its first picture whether there are offsets: a stream that starts
     without and gets them later ends the process with a segmentation fault, so every picture is marked, with an offset
-    of 0 where nothing is wanted (the bytes are then those of a stream without any). And it ignores them with
+    of 0 where no region is wanted (the bytes are then those of a stream without any). And x265 ignores offsets with
     ``aq-mode=0``, which the presets ultrafast and superfast set.
     """
 
     def __init__(self) -> None:
         self._graph: Graph | None = None
         self._regions: Sequence[Region] = ()
-        """Those of the graph."""
+        """The regions of the graph."""
 
     def tag(self, picture: av.VideoFrame, regions: Iterable[Region], *, whole: float = 0.0) -> av.VideoFrame:
         """The same picture with these regions; where two overlap, the deeper one counts.
 
-        ``whole`` is an offset of the whole picture, to which those of the regions are added. The result is valid
+        ``whole`` is an offset of the whole picture, to which the regions' offsets are added. The result is valid
         until the next call: its side data belongs to the filter graph of this call.
         """
         size = (picture.width, picture.height)
@@ -101,7 +101,7 @@ class RegionTagger:
 
 def _attaching(regions: Iterable[Region], picture: av.VideoFrame) -> Graph:
     graph = Graph()
-    graph.threads = 1  # else a pool of as many as there are cores, made for each graph
+    graph.threads = 1  # else each graph makes a pool of one thread for each core
     last = graph.add_buffer(
         width=picture.width,
         height=picture.height,
@@ -119,7 +119,7 @@ def _attaching(regions: Iterable[Region], picture: av.VideoFrame) -> Graph:
 
 
 def usable(regions: Iterable[Region], *, size: tuple[int, int]) -> list[Region]:
-    """Clip to the picture, deepest first, at most `MOST_REGIONS`; one of offset 0 where none is left."""
+    """Clip to the picture, deepest first, at most `MOST_REGIONS`; one region of offset 0 where none is left."""
     width, height = size
     inside = []
     for region in regions:
@@ -161,7 +161,7 @@ class TrackRegions:
         return [Region((x1, y1, x2, y2), offset) for x1, y1, x2, y2 in blocks]
 
     def _blocks(self, boxes: Boxes) -> list[tuple[int, int, int, int]]:
-        # The padded boxes on the grid of blocks, inside the picture; those outside it are left out.
+        # The padded boxes on the grid of blocks, inside the picture; boxes outside it are left out.
         pad = (boxes[:, 2:] - boxes[:, :2]) * self.padding
         grown = np.concatenate([boxes[:, :2] - pad, boxes[:, 2:] + pad], axis=1)
         limits = np.array([*self.size, *self.size], np.float64)
@@ -180,18 +180,18 @@ class TrackRegions:
 
 
 class SpareRate:
-    """The steps of the quantiser by which frames are coded finer than x265 would, so that they use the rate.
+    """Steps of the quantiser by which frames are coded finer than by x265's own choice, so that they use the rate.
 
     x265 follows a scene slowly: a keyframe is as coarse as the VBV makes it, and after it the picture of a still
     camera would get better for five seconds while a third of the rate, and more, is left unused. So each frame whose
-    rest does not fit into the VBV makes the next ones finer. x265 knows nothing of it but the bits that it takes, and
-    keeps its VBV, but for the first frames where a still scene begins to move.
+    unused bits do not fit into the VBV makes the next ones finer. x265 sees only the bits that this takes, and
+    keeps its VBV, except in the first frames where a still scene begins to move.
     """
 
     _STEPS_PER_FRAME = 5.0
-    """For a frame that has used none of its share."""
+    """Added steps for a frame that has used none of its share."""
     _DECAY = 0.985
-    """Of the steps, by the next frame: what is no longer needed goes."""
+    """Factor on the steps from one frame to the next, so that unneeded steps fade."""
     _MOST_STEPS = 24.0
 
     def __init__(self, settings: EncoderSettings) -> None:
@@ -202,11 +202,11 @@ class SpareRate:
 
     @property
     def steps(self) -> int:
-        """Of the next frame; 0 for the first, which is a keyframe."""
+        """Steps for the next frame; 0 for the first, which is a keyframe."""
         return round(self._steps)
 
     def coded(self, size_bytes: int) -> None:
-        """A frame took so much."""
+        """Note a coded frame of ``size_bytes``."""
         self._free_bits = max(0.0, self._free_bits - 8 * size_bytes) + self._frame_bits
         lost_bits = max(0.0, self._free_bits - self._depth_bits)
         self._free_bits -= lost_bits
@@ -216,12 +216,12 @@ class SpareRate:
 
 _QP_STEPS = 51
 _RATE_BY_DEPTH = 0.45
-"""x265 spends .3 to .8 as a power of the depth: less from 60 kbps up in long flights, more in the first seconds."""
+"""x265's rate grows as a power of .3 to .8 of the depth: less from 60 kbps up in long flights, more at first."""
 _QP_TO_LAMBDA = 118
 _FEW_ROWS_PX, _SHALLOW_FRAMES = 192, 2.0
 """The rate is held from row to row, and up to this height there are at most three of the usual blocks of 64. Where
-the VBV holds less than these frames, blocks of 32 use .86 to 1 of the rate for .6 to .95, and are .2 to 1.6 dB
-better. In a deeper one they are as good or .3 dB worse, and so they are in higher pictures."""
+the VBV holds less than these frames, blocks of 32 use .86 to 1 of the rate where 64 use .6 to .95, and are .2 to 1.6
+dB better. In a deeper VBV they are as good or .3 dB worse, and so they are in higher pictures."""
 _WITHOUT_AQ = ("ultrafast", "superfast")
 """Presets without adaptive quantisation, where x265 ignores regions: a trace of it makes them count."""
 
@@ -235,15 +235,15 @@ class BaseEncoder:
         self._to_yuv = VideoReformatter()
         self._settings, self._workers = settings, NewThreads()
         self._spent = (0, 0)
-        """Once it is closed."""
+        """`spent`, once the encoder is closed."""
         self._context: VideoCodecContext | None = None
         self._tagger = RegionTagger()
         self._count = 0
         self._caller_ns = self._wall_ns = self._ended_ns = 0
-        """Processor time of the calling thread, time by the clock, and processor time of workers that have ended."""
+        """Processor time of the calling thread, wall time, and processor time of workers that have ended."""
         self._open()
         self.mean_qp = math.nan
-        """Of the frame encoded last: the quantiser parameter (0…51), averaged over its blocks."""
+        """Quantiser parameter (0…51) of the frame encoded last, averaged over its blocks."""
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
         """Encode ``frame.base_bgr``; with ``keyframe`` as an IDR that starts a new decodable run.
@@ -277,7 +277,7 @@ class BaseEncoder:
 
     @property
     def spent(self) -> tuple[int, int]:
-        """(processor time in nanoseconds, frames) so far; time by the clock where the system says no more."""
+        """(processor time in nanoseconds, frames) so far; wall time where the system gives no processor time."""
         if self._context is None:
             return self._spent
         workers_ns = self._workers.cpu_ns
@@ -286,7 +286,7 @@ class BaseEncoder:
         return self._caller_ns + self._ended_ns + workers_ns, self._count
 
     def close(self) -> None:
-        """End x265's threads, and give back its memory: 12.5 MB for each of some frames of 1280x720."""
+        """End x265's threads, and release its memory: 12.5 MB for each of some frames of 1280x720."""
         self._spent = self.spent
         self._context, self._tagger = None, RegionTagger()
 
@@ -299,7 +299,7 @@ class BaseEncoder:
 def yuv_picture(
     converter: VideoReformatter, base_bgr: Image, *, pixel_format: str = "yuv420p"
 ) -> av.VideoFrame:
-    """A picture, uint8 (height, width, 3) BGR, as an encoder takes it: BT.709, limited range."""
+    """A picture, uint8 (height, width, 3) BGR, in the encoder's format: BT.709, limited range."""
     return converter.reformat(
         av.VideoFrame.from_numpy_buffer(base_bgr, format="bgr24"),
         format=pixel_format,
@@ -320,7 +320,7 @@ def mean_qp_of(packet: av.Packet[Any]) -> float:
 
 
 def encoder_context(name: str) -> VideoCodecContext:
-    """An encoder of FFmpeg's; `UserError` where it was built without."""
+    """An encoder of FFmpeg; raises `UserError` if FFmpeg was built without it."""
     try:
         context = av.CodecContext.create(name, "w")
     except (av.error.FFmpegError, ValueError):
@@ -332,9 +332,9 @@ def encoder_context(name: str) -> VideoCodecContext:
 
 
 def _whole(settings: EncoderSettings) -> tuple[int, int]:
-    # Rate and depth of the VBV as x265 takes them: kilobits a second, and kilobits. At these depths a deeper one uses
-    # more of the rate, and from 7 to 8 kbit is 14 %: rounded alone, the bits spent would jump by 5 to 8 % there. So
-    # depth is rounded up, and what that adds is taken off the rate.
+    # Rate and depth of the VBV in x265's units: kilobits a second, and kilobits. At these depths a deeper VBV uses
+    # more of the rate, and from 7 to 8 kbit is 14 %: with rounding alone, the bits spent would jump by 5 to 8 %
+    # there. So depth is rounded up, and the rate lowered by the gain.
     exact_kbit = settings.bitrate_bps / 1000 * settings.vbv_s
     depth_kbit = max(1, math.ceil(exact_kbit))
     kbps = settings.bitrate_bps / 1000 * min(1.0, exact_kbit / depth_kbit) ** _RATE_BY_DEPTH
@@ -390,8 +390,8 @@ def _opened(settings: EncoderSettings) -> VideoCodecContext:
 class NewThreads:
     """The threads that a library starts within ``with``, so that they can be given the caller's priority.
 
-    Where a library lowers that of its own workers. To raise it again takes a right (``RLIMIT_NICE``, ``LimitNICE=+0``
-    of systemd): without, they stay as they are.
+    For a library that lowers the priority of its own workers. Raising it again takes a right (``RLIMIT_NICE``,
+    ``LimitNICE=+0`` of systemd): without it, they stay as they are.
     """
 
     def __init__(self) -> None:
@@ -407,12 +407,12 @@ class NewThreads:
 
     @property
     def cpu_ns(self) -> int | None:
-        """Processor time that they have taken; None where the system does not say."""
+        """Their processor time; None where the system does not give it."""
         spent = [_cpu_ns(thread) for thread in self._threads]
         return sum(spent) if spent and all(spent) else None
 
     def raise_priority(self) -> None:
-        """Let them go like the calling thread, whatever they have made of themselves meanwhile."""
+        """Give them the priority of the calling thread, whatever they have set themselves."""
         for thread in list(self._threads):
             try:
                 own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -430,7 +430,7 @@ def _threads() -> set[str]:
 
 
 def _cpu_ns(thread: str) -> int:
-    # Of a thread of this process (proc_pid_schedstat(5)); 0 where that is not known.
+    # Processor time of a thread of this process (proc_pid_schedstat(5)); 0 where it is not known.
     try:
         return int(Path(f"/proc/self/task/{thread}/schedstat").read_text(encoding="ascii").split()[0])
     except (OSError, ValueError, IndexError):

@@ -16,13 +16,13 @@ from hvt_edge.video.encoder import EncoderSettings, HardwareRow
 from hvt_edge.video.x265 import Region, encoder_context, mean_qp_of, yuv_picture
 
 _BT709, _LIMITED = 1, 1
-"""Of ITU-T H.273, and of FFmpeg's AVColorRange."""
+"""Values of ITU-T H.273, and of FFmpeg's AVColorRange."""
 _GOP_FRAMES = 60_000
 """No keyframe comes by itself for an hour at 15 fps; more does not fit hevc_qsv's 16 bits."""
 
 
 class HardwareEncoder:
-    """An `Encoder`. Raises `UserError` where the machine has no such device; `ValueError` where it delays."""
+    """An `Encoder`. Raises `UserError` if the machine has no such device; `ValueError` if it delays frames."""
 
     def __init__(self, settings: EncoderSettings, *, row: HardwareRow) -> None:
         self._row = row

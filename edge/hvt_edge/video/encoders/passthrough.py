@@ -1,10 +1,10 @@
 """``--encoder passthrough``: the camera's own units in place of an encoder's, measured before the flight and in it.
 
-Nobody can make its units smaller. Were the link's rate taken below what they need, the next keyframe would have no
-room, or nothing behind it. Then nothing arrives, and a rate that grows with what arrives never grows again. So the
+The camera's units cannot be made smaller. If the link's rate fell below their need, the next keyframe would have no
+room, or the frames behind it. Then nothing arrives, and a rate that grows with arrivals never grows again. So the
 camera's fullest window is the floor.
 
-A link that carries less must not get a queue for it (`LeastLink`): the pacer takes for lost what is overdue for long.
+A link that carries less must not get a queue for it (`LeastLink`): the pacer declares long overdue messages lost.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.x265 import Region
 
 _LONG_KEYFRAMES_S = 4.0
-"""A ground that joins, or has lost something, waits so long for a picture: it is told of at the start."""
+"""Longest keyframe interval without a note at the start: a ground that joins, or has lost frames, waits for it."""
 
 
 class Passthrough:
@@ -80,7 +80,7 @@ def about_keyframes(name: str, stream: CameraStream) -> str:
 
 
 _MARGIN = 1.1
-"""The flight has a fuller window than was seen, and ``status`` goes beside."""
+"""The flight has a fuller window than the survey, and ``status`` needs room beside it."""
 _MEMORY_NS = 30 * SECOND_NS
 """Time for which a fuller window is remembered, at most twice: a camera that stalled may have bunched its units."""
 
@@ -96,7 +96,7 @@ class FullestWindow:
         """Bytes of the fullest window so far."""
 
     def add(self, size_bytes: int, *, at_ns: int) -> int:
-        """Take in one unit; return the bytes of the window that ends with it."""
+        """Add one unit; return the bytes of the window that ends with it."""
         if self._inside and at_ns < self._inside[-1][0]:  # its clock was set back
             self._inside.clear()
             self._held = 0
@@ -109,23 +109,23 @@ class FullestWindow:
 
 
 def needed_bps(window_bytes: int, *, window_s: float, share: float, metadata_bps: int) -> int:
-    """The least budget whose windows have room for one so full, as `RollingBudget` counts, and some more."""
+    """The least budget whose windows have room for such a window, as `RollingBudget` counts, plus a margin."""
     base_bps = _MARGIN * 8 * window_bytes / window_s
     return math.ceil(max(base_bps / (BASE_PEAK * share), base_bps + metadata_bps))
 
 
 class LeastLink:
-    """Whether all that was sent has left: it is reported, or a link of the least rate would have carried it by now.
+    """Tells when all sent bytes have left: reported, or carried by now by a link of the least rate.
 
-    So long a keyframe waits with which the stream begins anew. Time is an argument. ``unreported_bytes()`` is of all
-    units that no ground has reported; 0 too where none reports.
+    The keyframe with which the stream begins anew waits until then. Time is an argument. ``unreported_bytes()``
+    counts all units that no ground has reported; 0 too where none reports.
     """
 
     def __init__(self, least_bps: int, *, unreported_bytes: Callable[[], int]) -> None:
         self._least_bps = least_bps
         self._unreported_bytes = unreported_bytes
         self._queued_bytes = 0.0
-        """The bytes that such a link would still hold."""
+        """The bytes that a link of the least rate would still hold."""
         self._drained_ns = 0
 
     def sent(self, size_bytes: int, *, now_ns: int) -> None:
@@ -133,7 +133,7 @@ class LeastLink:
         self._queued_bytes += size_bytes
 
     def is_free(self, now_ns: int) -> bool:
-        """Whether nothing of it is on its way any more."""
+        """Whether no sent bytes are in flight any more."""
         self._drain(now_ns)
         return self._queued_bytes <= 0
 
@@ -146,8 +146,8 @@ class LeastLink:
 class CameraRates:
     """Called before each of the camera's keyframes for the link, in place of `EncoderReconfiguration`.
 
-    What a ground has commanded holds from there on, before it is asked whether there is room. The floor of the pacer
-    becomes what the camera needs, as far as the budget goes. ``needed(window_bytes)`` says how much that is;
+    A ground's command takes effect from there on, before room is checked. The pacer's floor becomes the camera's
+    need, up to the budget. ``needed(window_bytes)`` returns that rate;
     ``least_bps`` is ``--min-budget``, and ``surveyed_bytes`` the fullest window before the flight.
     """
 
@@ -167,7 +167,7 @@ class CameraRates:
         self._since_ns: int | None = None
 
     def observe(self, unit: AccessUnit) -> None:
-        """Take in each unit of the camera, sent or not."""
+        """Note each unit of the camera, sent or not."""
         at_ns = unit.capture_ns
         size_bytes = line_bytes(len(unit.data), self._reconfiguration.edge_id)
         held_bytes = self._window.add(size_bytes, at_ns=at_ns)
@@ -176,7 +176,7 @@ class CameraRates:
         self._newest_bytes = max(self._newest_bytes, held_bytes)
 
     def at_keyframe(self, now_ns: int) -> None:
-        """The next unit is a keyframe, and was observed."""
+        """Called before a keyframe is sent, once it was observed."""
         self._reconfiguration(1, now_ns)  # which may take a command
         pacer = self._reconfiguration.pacer
         if pacer is None:

@@ -1,7 +1,7 @@
-"""Three seconds of the scene through an encoder before the flight: does it stay within what the budget allows?
+"""Three seconds of the scene through an encoder before the flight: does it stay within the budget's limits?
 
-A frame that bursts is not dropped, it waits for its window. So an encoder that overshoots makes the picture late all
-the time, and takes from stills what is theirs. x265's peaks are known (`encoder_settings`); another's are measured:
+A frame that is too large is not dropped, it waits for its window. So an encoder that overshoots makes the video late
+all the time, and takes the stills' share. x265's peaks are known (`encoder_settings`); another's are measured:
 the fullest window, and the largest of two keyframes.
 """
 
@@ -25,10 +25,10 @@ _RUN_S = 3.0
 _MOST_WINDOW_S = 1.5
 """A longer window is not measured: half of the run would be its first keyframe."""
 _MOST_KEYFRAME_SHARE = 0.5
-"""Of the base's share of a window."""
+"""Largest keyframe, as a share of the base's part of a window."""
 _MOST_RUNS = 3
 _LEAST_HEADROOM = 0.5
-"""An encoder that has to be lowered further wastes most of the budget, most of the time."""
+"""An encoder whose target must be lowered further wastes most of the budget, most of the time."""
 _MARGIN = 0.97
 """The flight is longer than the run, and will have a fuller window."""
 
@@ -49,20 +49,20 @@ class Measured:
     """The measured bytes of an encoder, in line bytes."""
 
     window_bytes: int
-    """The fullest window."""
+    """Bytes of the fullest window."""
     keyframe_bytes: int
-    """The largest keyframe."""
+    """Bytes of the largest keyframe."""
 
     def overshoot(self, limit: Allowed) -> float:
-        """The worse of both over what is allowed; above 1 is too much."""
+        """The larger of both ratios to the limits; above 1 is too much."""
         return max(self.window_bytes / limit.window_bytes, self.keyframe_bytes / limit.keyframe_bytes)
 
 
 def allowed(*, size: tuple[int, int], fps: float, total_bps: int, base_bps: int, window_s: float) -> Allowed:
     """The limits that hold in flight (`RollingBudget`): `BASE_PEAK` times B_v in a window, and B_tot.
 
-    ``fps`` is of coded frames; ``total_bps`` without metadata, ``window_s`` that of the budget. A keyframe may take
-    half of the base's part of a window, and what x265 needs of this size where that is more.
+    ``fps`` is the rate of coded frames; ``total_bps`` without metadata, ``window_s`` the budget's. A keyframe may
+    take half of the base's part of a window, or x265's need at this size if that is more.
     """
     window_s = min(window_s, max(_MOST_WINDOW_S, 2 / fps))
     share_bytes = base_bps * window_s / 8
@@ -80,7 +80,7 @@ def run_frames(fps: float, limit: Allowed) -> int:
 
 
 def measure(units: Sequence[AccessUnit], limit: Allowed, *, edge_id: str) -> Measured:
-    """The fullest window of so many frames, and the largest keyframe."""
+    """The fullest window of the limit's frames, and the largest keyframe."""
     sizes = [line_bytes(len(unit.data), edge_id) for unit in units]
     sums = [0, *accumulate(sizes)]
     frames = min(limit.window_frames, len(sizes))
@@ -102,7 +102,7 @@ def headroom_of(
 
     ``open_at(share)`` opens it at that share of its target. ``scene()`` gives the ``frames`` of a run, of which the
     first and the middle one are keyframes; it may give fewer, and none where the flight is over. Raises `UserError`
-    where the encoder overshoots also with its target lowered, or gives what does not decode.
+    where the encoder overshoots also with its target lowered, or its units cannot be decoded.
     """
     share, first, last = 1.0, None, None
     for _ in range(_MOST_RUNS):
