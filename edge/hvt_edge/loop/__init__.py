@@ -1,4 +1,4 @@
-"""One frame after the other: `realtime`, or `lockstep` with media time; `counts` has frames and processors.
+"""One frame after the other: `realtime`, or `lockstep` with media time; `counts` counts frames and processor time.
 
-`pose` says where the camera was, and has the door to the extras that know it.
+`pose` defines a source of camera poses, and opens those of extras.
 """

@@ -1,4 +1,4 @@
-"""The counters of the frame loop, and the processor time that every frame would take, and that there is."""
+"""The counters of the frame loop, and the processor time that all frames would need, and that is free."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _LEAST_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Cores:
-    """In processor cores; 0 where it is not measured."""
+    """Processor time in cores; 0 where it is not measured."""
 
     needed: float = 0.0
-    """By this process, had it left out nothing."""
+    """Need of this process, had it left out no frame."""
     free: float = 0.0
-    """Left by others."""
+    """Cores that other processes leave."""
     taken: float = 0.0
-    """By this process."""
+    """Cores that this process takes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class _Sample:
     wall_s: float
     own_s: float
     busy_s: float
-    """Of all processes on the cores that this one may use."""
+    """Busy time of all processes on the cores that this one may use."""
 
 
 class CpuMeter:
@@ -55,9 +55,9 @@ class CpuMeter:
         self._short: list[Cores] = []
 
     def measure(self, *, scale: float, short: bool) -> None:
-        """The time since the last call; ``scale``: by how much it would have been more without what was left out.
+        """Measure the time since the last call; ``scale``: factor to the need without left-out work.
 
-        ``short``: something was left out for want of time.
+        ``short``: work was left out for want of time.
         """
         last, here = self._last, _sample()
         if last is None or here is None or here.wall_s - last.wall_s < _LEAST_S:
@@ -74,20 +74,20 @@ class CpuMeter:
 
     @property
     def short(self) -> Cores:
-        """The mean of the times in which something was left out."""
+        """The mean of the measurements in which work was left out."""
         rows = [(one.needed, one.free, one.taken) for one in self._short] or [(0.0, 0.0, 0.0)]
         return Cores(*(sum(column) / len(rows) for column in zip(*rows, strict=True)))
 
 
 def processors() -> float:
-    """Processors that this process may use: those it may run on, or less by the limit of its control group."""
+    """Processors that this process may use: those it may run on, or fewer by the limit of its control group."""
     return min(len(usable_cores()), quota())
 
 
 def quota(groups: Path = _GROUPS, top: Path = _TOP) -> float:
     """Processors that a container or systemd gives this process: the least of its control group and those above.
 
-    Of version 1 or 2. In a container the group may be called otherwise than where it lies: the top counts as well.
+    Version 1 or 2. In a container the group's name may differ from its path: the top counts as well.
     """
     limits = [math.inf]
     with contextlib.suppress(OSError):
@@ -139,55 +139,55 @@ class FrameCounts:
     groups: Counter[FrameGroup] = field(default_factory=Counter)
     """The outcome of each frame that came to the loop, each in one group."""
     source_groups: Counter[FrameGroup] = field(default_factory=Counter)
-    """Frames that did not come to it: damaged, or more than the base rate takes."""
+    """Frames that did not come to the loop: damaged, or beyond the base rate."""
     encoded: int = 0
     unanalyzed: int = 0
     """Coded, or left out by frame decimation, and skipped by perception, because stills or detection were behind."""
     encode_ns: int = 0
     paused_ns: int = 0
-    """How long the clock of a clip stood still, because the machine was too slow to play it in real time."""
+    """Total time for which a clip's clock stood still, because the machine was too slow to play it in real time."""
     newest_came_ns: int | None = None
     """When the source gave the newest frame; None before the first."""
     resumed_ns: int = 0
-    """When it was opened again."""
+    """When the source was opened again."""
     last_index: int = -1
     first_capture_ns: int | None = None
     last_capture_ns: int = 0
     cpu: CpuMeter = field(default_factory=CpuMeter)
     _source_before: tuple[int, int] = (0, 0)
     _measured: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
-    """Captured, dropped for want of time, not analyzed, time of encoding and of perception when it was measured."""
+    """At the last measurement: frames captured, dropped as late, not analyzed; encoding and perception time."""
 
     @property
     def captured(self) -> int:
-        """Frames that came to the loop, those included that it was too slow for."""
+        """Frames that came to the loop, including those for which it was too slow."""
         return self.groups.total()
 
     @property
     def dropped_cpu(self) -> int:
-        """Before encoding: the machine was behind."""
+        """Frames dropped before encoding because the machine was behind."""
         return self.groups["processor"]
 
     def account(self, *, coded_fps: float, auto_fps: bool) -> FrameAccount:
         return FrameAccount(dict(self.groups + self.source_groups), coded_fps, auto_fps)
 
     def drop(self, group: FrameGroup, count: int = 1) -> None:
-        """Count frames that were dropped before anything was decided on them."""
+        """Count frames that were dropped before any decision on them."""
         if count:
             self.groups[group] += count
 
     def settle(
         self, decision: FrameDecision, *, coded: bool, taken: bool = True, has_viewer: bool = True
     ) -> None:
-        """A frame on which ``decision`` was taken is done with; once for each.
+        """Count a frame on which ``decision`` was taken; once for each.
 
-        ``coded``: there is a unit; ``taken``: it was sent or stored; ``has_viewer``: somebody
+        ``coded``: it has a unit; ``taken``: it was sent or stored; ``has_viewer``: a program
         subscribes to the video.
 
         | decision | coded | taken | has_viewer | group |
         |---|---|---|---|---|
         | skip | | | | frame_rate |
-        | hold | | | | who held it: budget, link, closer_look … |
+        | hold | | | | the holder: budget, link, closer_look … |
         | code | no | | | encoder |
         | code, to the store | yes | no | | link |
         | code, to the link | yes | no | | budget |
@@ -215,7 +215,7 @@ class FrameCounts:
         self._source_before = (source.unreadable, source.passed_over)
 
     def note_source(self, source: Source) -> None:
-        """Take over the frames that the source left out by itself."""
+        """Take over the source's counts of frames that it left out by itself."""
         unreadable, passed_over = self._source_before
         self.source_groups["unreadable"] = source.unreadable - unreadable
         self.source_groups["frame_rate"] = source.passed_over - passed_over
@@ -232,7 +232,7 @@ class FrameCounts:
         self.encode_ns += encode_ns
 
     def measure_cpu(self, *, perception_ns: int) -> None:
-        """About once a second: the cost of all frames, estimated from those that were not left out."""
+        """Called about once a second: the cost of all frames, estimated from those that were not left out."""
         here = (self.captured, self.dropped_cpu, self.unanalyzed, self.encode_ns, perception_ns)
         captured, dropped, unanalyzed, encode_ns, spent_ns = (
             new - old for new, old in zip(here, self._measured, strict=True)
@@ -244,7 +244,7 @@ class FrameCounts:
         self.cpu.measure(scale=scale, short=bool(dropped or unanalyzed))
 
     def duration_s(self, fps: float) -> float:
-        """From the first frame sent to the last by their capture, with one frame's length."""
+        """Capture time from the first frame sent to the last, plus one frame's length."""
         if self.first_capture_ns is None:
             return 0.0
         return (self.last_capture_ns - self.first_capture_ns) / SECOND_NS + 1 / fps

@@ -1,8 +1,8 @@
 """The frame loop in lockstep: as fast as the parts allow, nothing dropped, every window in media time.
 
-The same input gives the same bytes and stills, however fast the machine: what is done side by side (a frame is
-encoded while the one before it is analyzed) does not change the order in which the budget is spent, and what a ground
-reports counts a fixed number of frames later.
+The same input gives the same bytes and stills, however fast the machine: parallel work (a frame is
+encoded while the one before it is analyzed) does not change the order in which the budget is spent, and a ground's
+report counts a fixed number of frames later.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.stage import BaseStage
 
 _AHEAD_S = 1.0
-"""The edge's lead over the ground, in media time: reports of the ground count so much later."""
+"""The edge's lead over the ground, in media time: reports of the ground count that much later."""
 _GROUND_GONE_S = 20.0
-"""A ground that has not answered for so long is not waited for again."""
+"""The loop does not wait again for a ground that has not answered for this long."""
 _UNSUBSCRIBED_S = 2.0
-"""Nor one that has not subscribed for so long; a link may break and come back."""
+"""Nor for one that has not subscribed for this long; a link may break and come back."""
 _STOP_S = 0.3
-"""How long the ground is waited for when the run is to stop."""
+"""How long the loop waits for the ground when the run is to stop."""
 _POLL_S = 0.1
 
 
 @dataclass(eq=False)
 class LockstepPace:
-    """Runs frames in media time; where a ground is there at the start, the loop waits for its answers.
+    """Runs frames in media time; if a ground is there at the start, the loop waits for its answers.
 
     ``fps`` counts frame indices a second; ``clock`` advances with each frame. The one worker of ``executor`` runs
     perception beside the next frame's encoding; it is closed with the pace.
@@ -69,9 +69,9 @@ class LockstepPace:
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode this frame while the one before is analyzed; send that one's stills, then this one's unit.
 
-        A frame that is not coded is analyzed all the same: its source may show what no base frame does.
+        A frame that is not coded is analyzed all the same: its source may show objects that no base frame does.
         """
-        del missed  # of a camera, whose frames wait for nobody
+        del missed  # of a camera, which cannot run in lockstep
         if frame is None:
             return
         now_ns = frame.capture_ns
@@ -113,7 +113,7 @@ class LockstepPace:
         analyzed = analysis.result()
         sent = self.stills.send_requested(now_ns=frame.capture_ns, held=held)
         sent |= self.stills.step(analyzed, now_ns=frame.capture_ns, held=held)
-        # Of other frames the ground learns nothing, and answers nothing.
+        # The ground receives nothing of other frames, and answers nothing.
         if sent or coded_index == frame.index:
             self._in_flight.append((frame.index, coded_index, sent))
 

@@ -1,4 +1,4 @@
-"""Where the camera is: the contract of a source of poses, the door to those of extras, reports to the ground."""
+"""The camera's pose: the contract of a source of poses, the opener of extras' sources, reports to the ground."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from hvt_edge.link.transmitter import Transmitter
 
 _GROUP: Final = "hvt.poses"
 _FILE: Final = "file"
-"""The entry point of all that no other is named for."""
+"""The entry point for every ``--pose`` whose word names no other."""
 _WHAT: Final = "pose source"
 MOST_GAP_S: Final = 10.0
 _BEYOND_NS: Final = SECOND_NS
-"""So long before the first pose and after the last one they are still taken."""
+"""How long before the first pose and after the last one they still count."""
 _MOST_BPS: Final = 300
 """Payload bits a second: a report a second, less often where that takes more."""
 _EARLY: Final = 0.97
-"""Frames come a little early or late: a report that is due nearly is due."""
+"""Frames come a little early or late: a report that is due nearly counts as due."""
 _PART: Final = "pose"
 
 
@@ -38,13 +38,13 @@ class PoseSource(Protocol):
     def at(self, media_ns: int, *, capture_ns: int) -> Pose | None:
         """The pose of a frame; None where it is not known. Quick: called in the frame loop.
 
-        ``media_ns`` counts from the source's first frame, ``capture_ns`` is the frame's, and the pose's then.
+        ``media_ns`` counts from the source's first frame; ``capture_ns`` is the frame's, and becomes the pose's.
         """
         ...
 
     @property
     def trouble(self) -> str:
-        """Why there is none now; empty where there is one, or nobody would expect one."""
+        """The reason why there is no pose now; empty where there is one, or none is expected."""
         ...
 
     @property
@@ -59,12 +59,12 @@ class OpenPose(Protocol):
     """An entry point of the group ``hvt.poses``; its name is the word before the colon of ``--pose``."""
 
     def __call__(self, spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) -> PoseSource:
-        """Open ``spec``, or raise `UserError`; ``hfov_deg`` is for where it says no field of view."""
+        """Open ``spec``, or raise `UserError`; ``hfov_deg`` is used where the source gives no field of view."""
         ...
 
 
 def open_pose(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) -> PoseSource:
-    """Open what ``--pose`` names, by the extra that knows it; see `OpenPose`."""
+    """Open ``--pose`` by the extra that knows it; see `OpenPose`."""
     word = spec.partition(":")[0]
     names = (word, _FILE)
     entry = next(filter(None, (the_one(_GROUP, one, what=_WHAT, built_in=False) for one in names)), None)
@@ -128,7 +128,7 @@ class PoseStage:
         try:
             pose = self.source.at(media_ns, capture_ns=capture_ns)
             make = None if pose is None else encoder.encode(pose)
-        except FOREIGN as error:  # what an autopilot says ends no flight, whatever it is
+        except FOREIGN as error:  # no value from an autopilot may end a flight
             self.failures.failed(_PART, reason_of(error))
             return
         if make is None:

@@ -1,4 +1,4 @@
-"""The frame loop in real time: base first, everything else behind it in a thread of its own.
+"""The frame loop in real time: base first, all other work behind it in a thread of its own.
 
 `LinkControl` decides by the ground's reports on pace, rate, repeated stills and the store, before each frame.
 """
@@ -25,42 +25,42 @@ from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 
 _MOST_GAP_NS = SECOND_NS // 4
-"""Of a clip that cannot be read in time so much is left out in a row, and no more, of its own time and of time as it
-passes: else nothing would be shown."""
+"""Most of a clip that is left out in a row if it cannot be read in time, in its own time and in real time:
+else nothing would be shown."""
 _STEADY_NS = 2 * SECOND_NS
-"""Where no frame was lost for so long, one may be late by two frames: a keyframe takes six times as long to code as
-others, on a small board longer than a frame, and would cost those behind it. A machine that is too slow for all gains
-no delay by that."""
+"""After this time without a lost frame, one may be late by two frames: a keyframe takes six times as long to code as
+others, on a small board longer than a frame, and would cost the frames behind it. A machine too slow for all frames
+gains no delay by that."""
 _BEFORE_KEYFRAME_NS = 3 * SECOND_NS // 10
-"""About as long as the detector takes on a small board: it does not begin so shortly before a keyframe. That may wait
-longer for its room in the budget."""
+"""About as long as the detector takes on a small board: it does not begin this shortly before a keyframe, which may
+wait longer for its room in the budget."""
 _MOST_LATE_NS = SECOND_NS
-"""A clip that is later than that, and not because of the link, is played slower."""
+"""A clip that is later than this, and not because of the link, is played slower."""
 _MOST_LINK_LATE_NS = 10 * SECOND_NS
 _LINK_BOUND_NS = SECOND_NS // 100
 _MOST_QUEUED_S = 0.5
-"""Of frames that wait for perception. Each of a longer queue is tracked through before a new one is searched: with a
-quarter of two cores boxes were 2.4 s old."""
+"""Longest queue of frames for perception. Each is tracked through before a new one is searched: with a longer queue,
+and a quarter of two cores, boxes were 2.4 s old."""
 _BEHIND_SHARE = 0.5
 """Share of the time between two frames: beyond it the loop is late."""
 
 _PART = "reports"
 _MOST_WAIT_NS, _MOST_WAIT_FRAMES = 100_000_000, 1.5
 """A frame that would wait longer than both for the budget's window is left out before it is encoded. A wait until the
-camera's next frame costs none, and about so long each waits a second after a keyframe that took long to code.
+camera's next frame costs none, and frames wait about that long for a second after a keyframe that took long to code.
 """
 
 
 @dataclass(eq=False)
 class RealtimePace:
-    """Takes frames when they are due; what it cannot code in time is dropped before it is encoded, never after.
+    """Takes frames when they are due; late ones are dropped before they are encoded, never after.
 
-    A clip is dropped from like a camera, and pauses for what that does not make up: its clock stands still for so
+    A clip loses frames like a camera, and pauses for the delay that this does not make up: its clock stands still so
     long, and capture times stay those at which a camera would have taken the frames.
 
     Video waits for nothing behind it: frames for which the stills' thread has no place are coded and sent all the
     same, and only their analysis is skipped. ``before_frame(now_ns)`` runs first, so that rates can track the link.
-    ``has_viewer()`` tells whether anybody subscribes to the video.
+    ``has_viewer()`` tells whether any program subscribes to the video.
     """
 
     base: BaseStage
@@ -81,9 +81,9 @@ class RealtimePace:
         self._must_code_ns = 0
         self._lost_ns = -_STEADY_NS
         self._none_due_ns = 0
-        """When no keyframe was due, last."""
+        """When last no keyframe was due."""
         self._sent_ns = self._link_late_ns = 0
-        """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
+        """When the last frame was sent; how late a clip is because of a slow link, not yet made up."""
         self._bound: FrameGroup = "processor"
         """The slowest step of the last frame: coding it, the budget's window, or the link."""
         self._sending_ns = 0
@@ -100,19 +100,19 @@ class RealtimePace:
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it.
 
-        ``missed`` counts frames of a live source that came before this loop took them; None: there is none now.
+        ``missed`` counts frames of a live source that came before this loop took them. Without a frame it is None.
         """
         if frame is None:
             self.before_frame(self.clock())
             return
-        if self._missed is None:  # before the first frame there was no loop
+        if self._missed is None:  # frames missed before the first do not count
             self._missed = missed
         newly_missed, self._missed = missed - self._missed, missed
         self.counts.drop(self._bound, newly_missed)
         behind = newly_missed > 0 and self._bound == "processor"
         if not self.live:
             frame = self._by_clip_clock(frame)
-            # A camera's own unit is never left out: all that follow build on it. The clip is played slower.
+            # A camera's own unit is never left out: all later ones build on it. The clip is played slower.
             in_time = self._in_time(frame) or frame.camera_unit is not None
             shown_lately = self.clock() - self._sent_ns < _MOST_GAP_NS
             if not in_time and frame.capture_ns < self._must_code_ns and shown_lately:
@@ -149,8 +149,8 @@ class RealtimePace:
 
     def _hand_over(self, frame: Frame, unit: AccessUnit | None, *, behind: bool) -> None:
         # Video goes first: perception gets no frame while the loop is late for want of processor, and fewer for a
-        # while after it lost one. Where each frame waits for its room in the budget, all are late, and nothing is
-        # scarce. Where nobody uses it, perception takes no time.
+        # while after it lost one. Where each frame waits for its room in the budget, all are late, and no processor
+        # is scarce. Where its results are not used, perception takes no time.
         used = self.stills.is_used(frame.capture_ns)
         cpu_budget, lost = self.stills.analyzer.cpu_budget, self.counts.dropped_cpu
         keyframe_due = self.base.keyframes.due(self._sent_ns + _BEFORE_KEYFRAME_NS)
@@ -169,7 +169,7 @@ class RealtimePace:
         self._worker.close()
 
     def _by_clip_clock(self, frame: Frame) -> Frame:
-        # Later where the machine is too slow; what the link took is made up for at twice the clip's speed.
+        # Later where the machine is too slow; delay by the link is made up at twice the clip's speed.
         now_ns = self.clock()
         self._link_late_ns = max(0, self._link_late_ns - (now_ns - self._sent_ns))
         late_ns = now_ns - frame.capture_ns - self.counts.paused_ns - self._link_late_ns
@@ -189,11 +189,11 @@ class RealtimePace:
 
 @dataclass(eq=False)
 class LinkControl:
-    """Applies receiver reports: `on_feedback` in the link's thread, all else in the frame loop.
+    """Applies receiver reports: `on_feedback` in the link's thread, the rest in the frame loop.
 
-    There is no pacer without ``--adapt``, no backlog where nothing is stored while the link is offline. Whoever
-    subscribes to the video and is no ground (``has_subscriber``, and not ``has_ground``) reports nothing: it gets all
-    that the budget allows, and is no link of which anything is known.
+    There is no pacer without ``--adapt``, no backlog where nothing is stored while the link is offline. A program
+    that subscribes to the video and is no ground (``has_subscriber``, and not ``has_ground``) reports nothing: it
+    gets all that the budget allows, and its link is unknown.
     """
 
     _: KW_ONLY
@@ -213,9 +213,9 @@ class LinkControl:
         self._primary = PrimaryReceiver()
 
     def before_frame(self, now_ns: int) -> None:
-        """Set budget, base rate and keyframe by the link's rate, and decide whether anything is sent at all."""
+        """Set budget, base rate and keyframe by the link's rate, and decide whether frames are sent at all."""
         ground = self.has_ground()
-        # A ground that has left, with somebody there still who reports nothing: what was known of the path is void.
+        # A ground has left, and the remaining subscriber reports nothing: the path's measurements are void.
         linked = ground or (self.has_subscriber() and not self._had_ground)
         self._had_ground = ground
         offline = self.backlog is not None and self.backlog.before_frame(now_ns, linked=linked)
@@ -224,7 +224,7 @@ class LinkControl:
         if self.pacer is None:
             return
         back = self.pacer.link(linked, reports=ground, now_ns=now_ns)
-        if offline:  # what is stored has the quality that the link had
+        if offline:  # stored objects have the quality that the link had
             self.reconfiguration.hold(now_ns)
         if offline or not linked:  # nothing is carried anywhere
             return
@@ -232,12 +232,12 @@ class LinkControl:
             self.keyframes.require(now_ns)
 
     def admits(self, now_ns: int, line_bytes: int | None = None, coding_ns: int = 0) -> bool:
-        """Whether a message of so many line bytes may be coded now; held back it would only wait and grow old.
+        """Whether a message of ``line_bytes`` may be coded now; a delayed one would only wait and grow old.
 
-        What counts is the room once it is coded, ``coding_ns`` from now: at two frames a second, of which two fill a
-        window, the last but one has left it by then.
-        The size is of what would go: a keyframe, with which x265 is opened at the link's rate, has room where a
-        frame of the rate of before has none. None is an average frame.
+        The room once it is coded counts, ``coding_ns`` from now: at two frames a second, of which two fill a window,
+        the last but one has left it by then.
+        The size is the next message's: a keyframe, with which x265 is opened at the link's rate, has room where a
+        frame of the former rate has none. None is an average frame.
         """
         if self.pacer is None:
             return True
@@ -256,7 +256,7 @@ class LinkControl:
         note: Callable[[str], None],
         turn: Callable[[], None] = lambda: None,
     ) -> None:
-        """After the last frame of a recorded source: send what was stored, and call ``turn`` meanwhile."""
+        """After the last frame of a recorded source: send stored objects, and call ``turn`` meanwhile."""
         self.transmitter.budget.end_base()
 
         def before_frame(now_ns: int) -> None:
@@ -269,7 +269,7 @@ class LinkControl:
     def _after_last(self, now_ns: int) -> None:
         self.stills.store_lost(now_ns)
         self.before_frame(now_ns)
-        self.admits(now_ns)  # which gives up what is lost: nothing else would, without frames
+        self.admits(now_ns)  # this gives up lost messages: without frames nothing else would
 
     def on_feedback(self, feedback: Feedback) -> None:
         """A ground reports (any thread). Where that fails the rate falls to its floor until a report counts again."""
@@ -285,7 +285,7 @@ class LinkControl:
             self.failures.works(_PART)
 
     def _apply(self, feedback: Feedback, *, now_ns: int) -> None:
-        # Whether the report counts is decided here, once.
+        # The decision whether the report counts is made here, once.
         sent = (self.transmitter.base_sequence, self.transmitter.still_sequence)
         report = self._primary.judge(feedback, sent=sent, now_ns=now_ns)
         self.keyframes.report_losses(feedback.receiver_id, feedback.lost_so_far + feedback.corrupt)
@@ -302,7 +302,7 @@ class LinkControl:
             )
         if self.backlog is not None:
             self.backlog.on_feedback(feedback, now_ns=now_ns)
-        # Late: who waits there for the end goes on to store what is not acknowledged.
+        # Last: a thread that waits there for the end then stores unacknowledged messages.
         self.inbox.on_report(report)
         if report.primary:
             self.transmitter.resend(feedback.missing_base, now_ns=now_ns)
@@ -317,7 +317,7 @@ def wait_for_ground(
     note: Callable[[str], None],
     turn: Callable[[], None] = lambda: None,
 ) -> None:
-    """Until a ground subscribes, or for ``--wait``: a recorded source can wait for its audience.
+    """Wait until a ground subscribes, or for ``--wait``: a recorded source can wait for its audience.
 
     ``turn`` is called meanwhile.
     """

@@ -22,10 +22,10 @@ from hvt_edge.wiring.video import least_rate_bps
 _AUTO_STILL_SHARE = 0.15
 """Share of the budget, at most, for stills that are not known to pay: the base loses .015 of F1 by it."""
 SPARSE_SHARE = 0.9
-"""Of the budget, at most, for a base of which not all frames are coded. Each has more bits then; at 7.5 a second it
-still arrives within 1.5 times the delay of 15 a second with the whole budget."""
+"""Largest share of the budget for a base of which not all frames are coded. Each has more bits then; at 7.5 a second
+it still arrives within 1.5 times the delay of 15 a second with the whole budget."""
 _AUTO_REST_S = 8.0
-"""Between two keyframes for the sake of another split."""
+"""Least seconds between two keyframes that only change the split."""
 
 
 def make_link_settings(config: EdgeConfig) -> LinkSettings:
@@ -41,7 +41,7 @@ def make_link_settings(config: EdgeConfig) -> LinkSettings:
 
 
 def channels_of(config: EdgeConfig, *, live: bool) -> tuple[Channel, ...]:
-    """Those on which the edge may send; ``live``: its source is."""
+    """The channels on which the edge may send; ``live``: its source is live."""
     optional = {
         Channel.TRACKS: config.send_tracks,
         Channel.POSE: config.pose is not None,
@@ -66,7 +66,7 @@ def make_budget(config: EdgeConfig, *, base_bps: int, decimation: int) -> Rollin
 
 
 def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float) -> Split | None:
-    """The control of the base's share of the budget; None where it is fixed."""
+    """The control of the base's share of the budget; None where the share is fixed."""
     if not isinstance(config.video_share, str):
         return None
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
@@ -89,7 +89,7 @@ def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
 def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int, int]) -> Pacer | None:
     """The pacer, which tracks the link's rate; None where the budget stays as it is.
 
-    Of a camera that is passed through (``stream``) the rate is never below what it was seen to make.
+    For a passed-through camera (``stream``) the rate is never below the camera's surveyed rate.
     """
     if not config.adapts:
         return None
@@ -130,7 +130,7 @@ def make_least_link(config: EdgeConfig, line: Transmitter) -> LeastLink | None:
 
 
 def _camera_needs_bps(config: EdgeConfig, window_bytes: int, share: float) -> int:
-    # The budget that a camera needs whose fullest window has so many line bytes; ``share`` is the base's of it.
+    # The budget that a camera needs if its fullest window has ``window_bytes``; ``share`` is the base's share of it.
     return needed_bps(window_bytes, window_s=config.window, share=share, metadata_bps=config.metadata_bps)
 
 

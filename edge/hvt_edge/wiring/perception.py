@@ -1,4 +1,4 @@
-"""Perception and stills, from the settings: the detector, the analyzer, who chooses and makes stills."""
+"""Perception and stills, from the settings: the detector, the analyzer, and the parts that choose and code stills."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _DETAIL_WEIGHT = 5.0
 
 
 def make_detector(config: EdgeConfig) -> Detector:
-    """Open the detector, with weak detections kept: they may carry a track on, though not start one."""
+    """Open the detector, with weak detections included: they may carry a track on, though not start one."""
     detector = open_detector(
         config.detector,
         labels=config.labels,
@@ -63,7 +63,7 @@ def make_detector(config: EdgeConfig) -> Detector:
         nms_iou=config.nms_iou,
         head=config.head,
         threads=config.threads,
-        # By its speed auto may choose one this time and another the next, and their answers differ a little.
+        # By speed auto may choose one provider this time and another the next, and their answers differ a little.
         provider="cpu" if config.pace == "lockstep" and config.provider == "auto" else config.provider,
     )
     return tiled(detector, config.tiles) if config.candidates == "source" else detector
@@ -72,7 +72,7 @@ def make_detector(config: EdgeConfig) -> Detector:
 def open_for_flight(
     config: EdgeConfig, open_detector: Callable[[], Detector], warm_up: Callable[[Detector], None]
 ) -> Detector:
-    """Open the detector and warm it up, or leave that for when it is first used, where that may be never.
+    """Open the detector and warm it up; or put that off to its first use, if it may never be used.
 
     A method without stills needs no tracks, unless they are sent, or a ground requests them in flight.
     """
@@ -86,12 +86,12 @@ def open_for_flight(
 
 
 def unopened(config: EdgeConfig, open_detector: Callable[[], Detector]) -> Detector:
-    """In place of one that is still being opened when the flight ends: nothing is searched any more."""
+    """A stand-in for a detector that is still being opened when the flight ends: nothing is searched any more."""
     return _OpenedOnUse(open_detector, declared_class_names(config.detector) or _UNKNOWN)
 
 
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
-    """Run the detector once on a picture of the flight's shape: a runtime may compile for each."""
+    """Run the detector once on a picture of the flight's shape: a runtime may compile for each shape."""
     if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
         _log.warning("%s", uncalibrated("detector", config.detector))
     if config.candidates == "source":
@@ -108,7 +108,7 @@ def make_analyzer(
     trust: ViewTrust | None = None,
     cpu_budget: CpuBudget | None = None,
 ) -> Analyzer:
-    """Decoder, detector and tracker of the edge's own stream; without ``cpu_budget`` of a trial, unlimited."""
+    """Decoder, detector and tracker of the edge's own stream; without ``cpu_budget``, as in a trial, unlimited."""
     still_every = detect_still_every(config.detect_every, fps=config.nominal_fps)
     settings = TrackerSettings.starting_at(
         track_confidence(config), camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
@@ -127,7 +127,7 @@ def make_analyzer(
 
 
 def _scale_search(config: EdgeConfig, detector: FailingDetector) -> ScaleSearch | None:
-    # What it promises are sums of probabilities.
+    # The gain that a scale promises is a sum of probabilities.
     if not searches_scale(config.tiles, pace=config.pace) or not is_calibrated(
         config.detector, role="detector"
     ):
@@ -144,9 +144,9 @@ def make_shadow(
 ) -> ShadowGround | None:
     """The shadow ground, which measures how much of the source the base shows; None where nothing depends on it.
 
-    It goes on from what was measured ``before``.
+    It continues from the measurements of ``before``.
 
-    `MOTION` remembers the pictures of one stream, and those of the base are another.
+    `MOTION` remembers the pictures of one stream, and the base's pictures are another stream.
     """
     if not config.measures or config.detector == MOTION:
         return None
@@ -165,12 +165,12 @@ def _whole(detector: FailingDetector) -> Callable[[Image], Detections | None]:
 
 
 def track_confidence(config: EdgeConfig) -> float:
-    """From where a detection starts a track: as given, else as the detector's file says."""
+    """Confidence at which a detection starts a track: as given, else as the detector's file says."""
     return default_confidence(config.detector) if config.confidence is None else config.confidence
 
 
 def check_codecs(config: EdgeConfig) -> None:
-    """Code a picture once: `UserError` if a library behind a codec does not do its part."""
+    """Code a picture once: raises `UserError` if a library behind a codec does not work."""
     ramp = np.arange(_TRIAL_PX, dtype=np.uint8)
     crop = np.stack(np.broadcast_arrays(4 * ramp[:, None], 4 * ramp, np.uint8(90)), axis=2)
     for flag, name in (("still-codec", config.still_codec), ("fallback-codec", config.fallback_codec)):
@@ -190,7 +190,7 @@ def check_codecs(config: EdgeConfig) -> None:
 def make_method(config: EdgeConfig, view: View, *, name: str | None = None) -> Method:
     """The method of the settings, or another by its name.
 
-    With auto details count as far as the base has no pixels for them. Raises `UserError` for an unknown name.
+    With auto, details count in proportion to the pixels that the base lacks. Raises `UserError` for an unknown name.
     """
     own = method(config.method)
     policy = own if name is None else method(name)
@@ -206,7 +206,7 @@ def shows_details(config: EdgeConfig, view: View) -> bool:
 
 
 def _hidden_pixels(view: View) -> float:
-    # 0…1: the share of the source's pixels that the base has no pixel of its own for.
+    # 0…1: the share of the source's pixels that have no pixel of their own in the base.
     return max(0.0, 1 - view.scale**2)
 
 
@@ -222,14 +222,14 @@ def make_maker(config: EdgeConfig, *, readable: Callable[[str], bool]) -> StillM
         quality_pct=config.jpeg_quality,
         fidelity_db=config.fidelity,
         padding=config.padding,
-        # Others have a lowest quality; what builds on the base would be made to fit whatever there is.
+        # Other codecs have a lowest quality; a codec that builds on the base would fit any number of bytes.
         least_bytes=_LEAST_STILL_BYTES if codec.needs_base else 0,
         readable=readable,
     )
 
 
 class _OpenedOnUse:
-    # A detector that is opened when it is first used, for who may never use it; its class names are known.
+    # A detector that is opened at its first use, for edges that may never use it; its class names are known.
 
     def __init__(self, open_detector: Callable[[], Detector], class_names: tuple[str, ...]) -> None:
         self._open = open_detector

@@ -1,6 +1,6 @@
-"""Every part of an edge, built once: `Link`, then `Stills`, then `Video`, each from what stands before it.
+"""Every part of an edge, built once: `Link`, then `Stills`, then `Video`, each from the parts before it.
 
-`Stages` has them, and what a ground reaches of them.
+`Stages` holds them, and the ends that a ground's messages reach.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ from hvt_edge.wiring.video import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flight:
-    """What all parts of one flight are built from."""
+    """The objects from which all parts of one flight are built."""
 
     stack: ExitStack
-    """Files and threads end with it."""
+    """Closes files and threads at the end."""
     config: EdgeConfig
     source: Source
     detector: FailingDetector
@@ -95,10 +95,10 @@ class Flight:
 
 
 class Link:
-    """What may be sent, and who sends it: the rates, the encoder that is opened for them, budget and pacer."""
+    """The rates, the encoder that is opened for them, budget and pacer, and the transmitter."""
 
     def __init__(self, flight: Flight) -> None:
-        """Raises `UserError` where the encoder does not take the settings."""
+        """Raises `UserError` where the encoder refuses the settings."""
         config, beginning, lockstep = flight.config, flight.beginning, flight.lockstep
         size, decimation = flight.source.view.base_size, beginning.decimation
         base_bps = base_rate_bps(config.budget_bps, beginning.share, metadata_bps=config.metadata_bps)
@@ -148,7 +148,7 @@ class Link:
 
 
 class Stills:
-    """Perception, who chooses and codes stills, and the store for an outage."""
+    """Perception, the parts that choose and code stills, and the store for an outage."""
 
     def __init__(self, flight: Flight, link: Link) -> None:
         config, view, clock = flight.config, flight.source.view, flight.clock
@@ -234,7 +234,7 @@ class Stills:
 
 
 class Video:
-    """The base stream: who codes it or passes it through, and who says when there is room for it."""
+    """The base stream: the stage that codes it or passes it through, and the control that admits its frames."""
 
     def __init__(self, flight: Flight, link: Link, stills: Stills, *, local_copy: LocalCopy | None) -> None:
         config, source, failures = flight.config, flight.source, flight.failures
@@ -271,7 +271,7 @@ class Video:
             keyframes=link.keyframes,
             transmitter=link.transmitter,
             local_copy=local_copy,
-            first_keyframe_bytes=link.operating.now.base_bps // 40,  # .2 s: what the VBV lets through
+            first_keyframe_bytes=link.operating.now.base_bps // 40,  # .2 s: the limit of the VBV
             regions=TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None,
             frame_skip=make_frame_skip(
                 config,
@@ -290,13 +290,13 @@ class Video:
 
 
 class Stages:
-    """The stages of a frame, the ends that a ground reaches, and what reports of them."""
+    """The stages of a frame, the ends that a ground's messages reach, and their reporters."""
 
     def __init__(self, flight: Flight, *, pose_source: PoseSource | None) -> None:
-        """Raises `UserError` where the encoder does not take the settings, or a file cannot be written."""
+        """Raises `UserError` where the encoder refuses the settings, or a file cannot be written."""
         config, view = flight.config, flight.source.view
         self.link = link = Link(flight)
-        # Files come after all that may be refused: a failed start leaves nothing behind.
+        # Files are made after all checks that may refuse the settings: a failed start leaves nothing behind.
         write_truth_of(flight.source, config.truth, fps=config.nominal_fps)
         local_copy = None
         if config.record_base:

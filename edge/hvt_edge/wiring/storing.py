@@ -19,7 +19,7 @@ _COPIES = "hvt.edge_copies"
 
 
 def check_files(config: EdgeConfig) -> None:
-    """Raise `UserError` for a file or folder that could not be written, is one that is read, or another's."""
+    """Raise `UserError` for a file or folder that cannot be written, or is also read, or belongs to another edge."""
     given = (config.source, config.pose, config.detector, config.labels, config.zenoh_config)
     reads = [Path(one) for one in given if one is not None]
     files = (
@@ -38,7 +38,7 @@ def check_files(config: EdgeConfig) -> None:
 
 
 def open_local_copy(path: Path, *, failures: Failures, wait: bool) -> AbstractContextManager[LocalCopy]:
-    """What keeps the base stream in a file, of an extra; ``wait``: it blocks where the card is slower (lockstep)."""
+    """An extra's writer of the base stream to a file; ``wait``: it blocks where the card is slower (lockstep)."""
     entry = the_one(_COPIES, "base", what="local copy", built_in=False)
     if entry is None:
         raise UserError("--record-base is of an extra that is not installed: pip install 'hvt[edge]'")
@@ -65,14 +65,14 @@ def default_folder(edge_id: str) -> Path:
 
 
 def check_store(config: EdgeConfig, *, live: bool) -> None:
-    """Raise `UserError` now where a store could not be made in mid-flight; makes nothing."""
+    """Raise `UserError` now if a store could not be made in mid-flight; makes nothing."""
     if not config.store_bytes(live=live):
         return
     path = store_folder(config)
     try:
         there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
         usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
-    except OSError:  # a part of the path may not be looked into
+    except OSError:  # a part of the path cannot be read
         usable, there = False, path.absolute()
     if not usable:
         kind = UserError if there == path.absolute() else NotYetError

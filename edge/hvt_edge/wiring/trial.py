@@ -26,13 +26,13 @@ from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, scene
 
 _FINE = 33.5
-"""Mean quantiser (0…51) of the last frames: below it all frames are coded. Measured as `PROMPT` was."""
+"""Mean quantiser (0…51) of the last frames below which all frames are coded. Measured as for `PROMPT`."""
 _MOST_NS = 3 * SECOND_NS
-"""On a slow machine comparing ends after so long: a flight is not to wait for its detector."""
+"""Time after which comparing ends on a slow machine: a flight must not wait for its detector."""
 _TRIAL_S = 0.85
 """The time of two comparisons of the shadow ground."""
 _LAST = 3
-"""The last so many count: those before still pay for the keyframe."""
+"""Number of last frames that count: earlier ones still pay for the keyframe."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Beginning:
 
     decimation: int
     share: float
-    """Of the budget, for the base stream."""
+    """The base stream's share of the budget."""
     preset: PresetChoice
     shadow: Shadow = UNMEASURED
     """The shadow ground's comparison of that second."""
@@ -63,7 +63,7 @@ def try_scene(
     measures = config.measures and feasible and config.encoder == X265
     shadow = make_shadow(config, detector) if measures else None
     rates = measures and (shadow is not None or (config.auto_fps and decimation > 1))
-    if not (rates or config.auto_preset):  # nothing would come of it
+    if not (rates or config.auto_preset):  # no decision depends on the trial
         return Beginning(decimation, _share(config, source.view, decimation), PresetChoice(config.preset))
     count = max(_LAST, 1 + math.floor(_TRIAL_S * fps))
     analyzer = make_analyzer(config, detector=detector, view=source.view)
@@ -79,7 +79,7 @@ def try_scene(
         spent.append(encoder.spent)
         if shadow is not None and (until_ns is None or clock() < until_ns):
             shadow.compare(analyzer.analyze(frame, unit))
-    # Of a shorter scene, or an encoder that tells none, nothing is known.
+    # A shorter scene, or an encoder that reports no quantiser, gives no measurement.
     fine = len(quantisers) == count and sum(quantisers[-_LAST:]) / _LAST < _FINE
     if rates and config.auto_fps and fine:
         decimation = _most_frames(config, size, decimation)
@@ -91,7 +91,7 @@ def try_scene(
 
 
 def _preset(spent: Sequence[tuple[int, int]], *, fps: float) -> PresetChoice:
-    # By the cost of the frames after the keyframe; a scene of one frame tells nothing.
+    # By the cost of the frames after the keyframe; a scene of one frame gives no cost.
     if len(spent) < 2:
         return PresetChoice()
     frame_ns = (spent[-1][0] - spent[0][0]) / (spent[-1][1] - spent[0][1])
@@ -102,7 +102,7 @@ def _preset(spent: Sequence[tuple[int, int]], *, fps: float) -> PresetChoice:
 
 
 def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> int:
-    # All frames, or as many as x265 can follow the rate with.
+    # All frames, or the most at which x265 can still follow the rate.
     for fewer in range(1, decimation):
         if config.base_bps >= least_base_bps(size, config.nominal_fps / fewer, edge_id=config.edge_id):
             return fewer
@@ -110,7 +110,7 @@ def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> 
 
 
 def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEASURED) -> float:
-    # Where the base hides objects, stills find more than video would; what it shows in error they do not change.
+    # Where the base hides objects, stills find more than video would; false objects of the base they do not change.
     if not config.measures or config.fixed_share is not None:
         return config.share
     share = min(config.share, SPARSE_SHARE) if decimation > 1 else config.share

@@ -46,20 +46,20 @@ _log = logging.getLogger(__name__)
 
 _MOST_ENCODER_THREADS = 4  # a 720p picture has twelve rows of blocks, each some steps behind the one above
 _AUTO_LEAST_FPS = 7.5
-"""With ``--profile auto``: frames that are larger arrive later, and nobody asked for delay. Fewer only where a frame
-then still takes less time than a keyframe."""
+"""With ``--profile auto``: larger frames arrive later, and the user has not asked for delay. Fewer only where a
+frame then still takes less time than a keyframe."""
 _MOST_SILENT_S = 10
-"""A live source that gives no frame for so many seconds has no scene to try an encoder on."""
+"""After this many seconds without a frame a live source has no scene to try an encoder on."""
 _SAME_RATE = 0.02
-"""What a camera's rate may differ from --fps: 29.97 is 30."""
+"""Largest difference of a camera's rate from --fps: 29.97 is 30."""
 _REST_S = 10.0
-"""How often ``--fps auto`` may think again."""
+"""Least seconds between two decisions of ``--fps auto``."""
 _AUTO_WINDOW_S = 1.0
-"""With ``--profile auto`` it goes by the last second."""
+"""Window of its measurement with ``--profile auto``."""
 
 
 def base_size(config: EdgeConfig) -> BaseSize:
-    """The base stream's size, or how it follows from the source's."""
+    """The base stream's size, or the function that gives it from the source's size."""
     if config.fixed_size is not None:
         return config.fixed_size
     if config.passes_through:
@@ -71,7 +71,7 @@ def base_size(config: EdgeConfig) -> BaseSize:
 
 
 def say_size(config: EdgeConfig, view: View) -> None:
-    """Say it where the budget has made the picture smaller than it is by default."""
+    """Log it where the budget has made the picture smaller than its default."""
     if config.size is not None or config.passes_through:
         return
     usual = default_size(view.source_size, fit=cast("Fit", config.fit))
@@ -86,7 +86,7 @@ def say_size(config: EdgeConfig, view: View) -> None:
 
 
 def _affordable(config: EdgeConfig, size: tuple[int, int]) -> tuple[int, int]:
-    # This size, or the largest below it that the budget carries; where none is, the smallest.
+    # This size, or the largest below it that the budget carries; the smallest where it carries none.
     if config.budget_bps >= least_budget_bps(config, size, share=config.share) or min(size) < LEAST_SIDE_PX:
         return size
     smaller = [one for one in sizes_of(size) if one[0] * one[1] < size[0] * size[1]] or [size]
@@ -106,7 +106,7 @@ def default_size(source_size: tuple[int, int], *, fit: Fit) -> tuple[int, int]:
 
 
 def first_decimation(config: EdgeConfig, size: tuple[int, int]) -> int:
-    """Each n-th source frame is coded at the start."""
+    """The n at the start: each n-th source frame is coded."""
     return _chosen(config, size, size=size)[1]
 
 
@@ -161,7 +161,7 @@ def first_rates(config: EdgeConfig, decimation: int) -> Rates:
 
 
 def encoder_plan(config: EdgeConfig, size: tuple[int, int], *, headroom: float = 1.0) -> EncoderPlan:
-    """What encoders are opened with; with several threads only where bytes need not repeat."""
+    """The settings with which encoders are opened; several threads only where bytes need not repeat."""
     return EncoderPlan(
         name=config.encoder,
         size=size,
@@ -195,10 +195,10 @@ def _allowed(config: EdgeConfig, size: tuple[int, int], rates: Rates) -> Allowed
 def qualify_encoder(
     config: EdgeConfig, source: Source, *, clock: Callable[[], int], stop: threading.Event
 ) -> float:
-    """The share of its rate to set at the encoder, from three seconds of the scene; 1 for x265, without them.
+    """The share of its rate to set at the encoder, from three seconds of the scene; 1 for x265, without a run.
 
-    A camera that is passed through was looked at when it was opened.
-    Raises `UserError` with what was measured where it would not stay within the budget. A clip begins anew after it.
+    A passed-through camera was surveyed when it was opened.
+    Raises `UserError` with the measurement where it would exceed the budget. A clip begins anew after it.
     """
     if config.encoder == X265:
         return 1.0
@@ -239,7 +239,7 @@ def scene(
 
 
 def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
-    """The settings with the camera's frame rate, where its own units are sent; `UserError` where they cannot be."""
+    """The settings with the camera's frame rate, if its own units are sent; raises `UserError` if they cannot be."""
     stream, name = source.camera_stream, shown(str(config.source))
     if not config.passes_through:
         return config
@@ -269,7 +269,7 @@ def _qualify_camera(config: EdgeConfig, source: Source) -> None:
 def make_reconfiguration(
     config: EdgeConfig, operating: Operating, size: tuple[int, int], **parts: Any
 ) -> EncoderReconfiguration:
-    """What changes rates in flight; ``parts`` are what it does so with."""
+    """Make the part that changes rates in flight; ``parts`` are the further parts that it needs."""
     return EncoderReconfiguration(
         operating,
         size=size,
@@ -283,11 +283,11 @@ def make_reconfiguration(
 
 
 def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
-    """The floor of the link's rate, where the budget is not lower itself.
+    """The floor of the link's rate, unless the budget itself is lower.
 
-    Nobody can make a keyframe smaller than `keyframe_floor_bytes`. Were the rate taken below what one needs, none
-    would go; nothing arrives then, and a rate that grows with what arrives never grows again. What a camera's own
-    units need is measured (`hvt_edge.video.encoders.passthrough`).
+    No keyframe can be smaller than `keyframe_floor_bytes`. If the rate fell below a keyframe's need, none would be
+    sent; then nothing arrives, and a rate that grows with arrivals never grows again. The need of a camera's own
+    units is measured (`hvt_edge.video.encoders.passthrough`).
     """
     if config.passes_through:
         return config.min_budget_bps
