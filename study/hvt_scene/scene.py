@@ -40,7 +40,7 @@ from hvt_scene.world.traffic import SAMPLES_HZ, Mover, set_in_motion
 
 
 class Cast:
-    """Everybody, as parallel arrays: those who move first, then what stands still. Index i has the id i + 1.
+    """Everybody, as parallel arrays: those that move first, then those that stand still. Index i has the id i + 1.
 
     Attributes:
         sprites: their pictures.
@@ -48,7 +48,7 @@ class Cast:
         outlines_m: (N, `OUTLINE_POINTS`, 2) convex outlines about their centres, metres, body axes.
         heights_m: (N,).
         reach_m: (N,) from the centre to the farthest point of the outline.
-        codes: what is painted on roofs, by index; empty until `paint_codes`.
+        codes: the texts painted on roofs, by index; empty until `paint_codes`.
     """
 
     def __init__(self, movers: list[Mover], parked: list[Parked], *, rng: np.random.Generator) -> None:
@@ -155,7 +155,7 @@ class Scene:
         return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGRA2BGR), np.uint8)
 
     def truth(self, t_s: float) -> Truth:
-        """What the picture at ``t_s`` shows, from the same geometry that draws it."""
+        """The objects of the picture at ``t_s``, from the same geometry that draws it."""
         _, chosen, places, local = self._view(t_s)
         pixels = project(self.cast.outlines_m[chosen] @ turns(places).transpose(0, 2, 1), local)
         limit = np.array(self.size)
@@ -272,7 +272,7 @@ class Scene:
             blend(frame, boxes[row], picture, matrix=matrix, gain=float(gains[row]))
 
     def _draw_trees(self, frame: Bgra, pose: Matrix) -> None:
-        """Crowns that hang over what may pass or stand below them."""
+        """Crowns that hang over objects below them."""
         grove = self._grove
         local = tangents(pose, grove.places_m)
         half = 1.05 * grove.radii_m

@@ -17,7 +17,7 @@ from hvt_common.values import Boxes, View
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is in the picture at one moment, as parallel arrays ordered by id."""
+    """The objects in the picture at one moment, as parallel arrays ordered by id."""
 
     ids: npt.NDArray[np.int64]
     """(N,) one for each object, the same for the whole clip, from 1."""
@@ -57,7 +57,7 @@ class CodeInView:
 
 
 class TruthSource(Protocol):
-    """What `write_truth` needs of a scene."""
+    """The parts of a scene that `write_truth` needs."""
 
     duration_s: float
 

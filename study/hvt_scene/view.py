@@ -137,7 +137,7 @@ def project(points_m: Floats, local: Floats) -> Floats:
 def near_frame(local: Floats, reach_m: Floats, *, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
     """(N,) whether a thing that reaches so far from its place may touch the frame."""
     grain = np.sqrt(np.abs(np.linalg.det(local[:, :, :2])))
-    # A tilted camera stretches one axis more than the other; one and a half covers what `Appearance` allows.
+    # A tilted camera stretches one axis more than the other; one and a half covers all tilts of `Appearance`.
     margin = (1.5 * reach_m * grain)[:, None]
     spots = local[:, :, 2]
     return np.asarray(((spots > -margin) & (spots < np.array(size) + margin)).all(1), np.bool_)
@@ -193,7 +193,7 @@ def darken(frame: Bgra, shadows_px: Floats, *, strength: float) -> None:
 
 
 def blend(frame: Bgra, box: list[int], picture: Bgra, *, matrix: Matrix, gain: float) -> None:
-    """Warp a picture into the box x0 y0 x1 y1 of the frame, over what is there; ``gain`` lights its colours."""
+    """Warp a picture into the box x0 y0 x1 y1 of the frame, over the pixels there; ``gain`` lights its colours."""
     x0, y0, x1, y1 = box
     if x1 <= x0 or y1 <= y0:
         return

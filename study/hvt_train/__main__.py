@@ -91,7 +91,7 @@ def _join(arguments: argparse.Namespace) -> int:
 
 
 def _curve(arguments: argparse.Namespace) -> int:
-    """Loss (left axis) and what the checks measured (right axis, 0…1) over the steps of a training log, as SVG."""
+    """Loss (left axis) and the measures of the checks (right axis, 0…1) over the steps of a training log, as SVG."""
     with needs_extra("'hvt[study]'"):
         import matplotlib as mpl  # noqa: PLC0415
         from matplotlib.figure import Figure  # noqa: PLC0415

@@ -71,7 +71,7 @@ def drawn_pictures(
 
 
 def evaluate_drawn(detector: Detector, pictures: Sequence[Picture]) -> DrawnResult:
-    """mAP@0.5. What is less than 30 % visible or under 4 pixels counts neither for nor against.
+    """mAP@0.5. An object less than 30 % visible or under 4 pixels counts neither for nor against.
 
     The detector should be opened with a very low confidence, so that the whole curve is there.
     """
@@ -157,7 +157,7 @@ def _vehicles(detector: Detector, frame: Image) -> Boxes:
 
 
 def _one_each(boxes: Boxes) -> Boxes:
-    """Drop what lies over a better box: to "vehicle or not", car and van on one spot are one vehicle."""
+    """Drop boxes that lie over a better one: to "vehicle or not", car and van on one spot are one vehicle."""
     chosen: list[int] = []
     table = iou(boxes, boxes)
     for row in range(len(boxes)):
@@ -198,7 +198,7 @@ def print_speed(detector: Path, *, size: tuple[int, int] = (640, 384), runs: int
         model.run(image)
         wall_ms.append((time.perf_counter() - wall) * 1e3)
         cpu_ms.append((time.process_time() - cpu) * 1e3)
-    # Others on the machine lengthen the wall time; the CPU time of one thread is what the network itself costs.
+    # Others on the machine lengthen the wall time; the CPU time of one thread is that of the network itself.
     print(
         f"{detector.name} {size[0]}x{size[1]}, 1 thread: CPU median {np.median(cpu_ms):.1f} ms,"
         f" wall median {np.median(wall_ms):.1f} ms, least {min(wall_ms):.1f} ms"

@@ -30,7 +30,7 @@ from hvt_train.pictures.real import HeldOut
 from hvt_train.pictures.views import ViewSettings
 
 _CODED_SHARE = 0.65
-"""Of the pictures that go through x265: what a detector on a thin base meets. The others stay as they are."""
+"""Of the pictures go through x265, as a detector on a thin base meets them. The others stay as they are."""
 _PLAUSIBLE = (0.1, 10.0)
 """Slopes of a calibration; another one comes of too few boxes."""
 _STEPS_BETWEEN = 5
@@ -61,7 +61,7 @@ class FineTuneSettings:
 
 @dataclass(frozen=True, slots=True)
 class FineTuned:
-    """What came of it."""
+    """The result of the training."""
 
     steps: int
     best_step: int
@@ -100,9 +100,9 @@ def fine_tune(
     """Train a network of ``classes`` into the ONNX file ``out``, with calibrated scores; a log lies beside it.
 
     ``pool`` is of `fill_own`. ``held_out`` gives the pictures that are not trained on, anew at each call: the
-    calibration is fitted on them, and ``measure`` says how good the network of a file is on them; the best is kept.
+    calibration is fitted on them, and ``measure`` scores the network of a file on them; the best is kept.
     ``start`` is an ONNX file of the same network (else `UserError`), as whose classes those of the same kind begin.
-    ``on_step`` is called with the steps done, and what was measured where it was.
+    ``on_step`` is called with the steps done, and with the score of a step that was measured.
     """
     cv2.setNumThreads(1)
     torch.set_num_threads(settings.threads)

@@ -1,11 +1,11 @@
 """One file of two detectors: the aerial one, and YOLOX-nano with its COCO weights.
 
-What is learnt for views from above is forgotten for views aslant, and the other way round: two networks know both.
+A network that learns views from above forgets views aslant, and the other way round: two networks know both.
 The file has one input and one YOLOX head, as each of them has; to a program it is one detector.
 
 YOLOX-nano (Ge et al., 2021; Megvii, Apache-2.0) knows objects of some size at eye level and aslant. It gets the
-picture at half, where it costs four tenths of what the aerial network does, and its cells stand behind the
-aerial ones: strides of 16, 32 and 64 pixels. Three rules keep it to what it knows:
+picture at half, where it costs four tenths of the aerial network, and its cells stand behind the
+aerial ones: strides of 16, 32 and 64 pixels. Three rules keep it to its views:
 
 * its objectness is raised, so that a box that its authors' program shows (from .3) counts here (``hvt.confidence``);
 * a picture without colour is thermal, or of the night: there it sees people who are not there, and is not heard;
@@ -30,7 +30,7 @@ PREFIX = "street_"
 
 _OWN = "own_output"
 _STRIDES = (16, 32, 64)
-"""Of its cells, pixels of the whole picture: 8, 16 and 32 of what it is given."""
+"""Of its cells, pixels of the whole picture: 8, 16 and 32 of its input."""
 _THEIR_CONFIDENCE = 0.3
 _COCO_OF = {
     **{name: name for name in ("car", "truck", "bus", "bicycle")},
@@ -59,7 +59,7 @@ shrink (float[1, 3, height, width] images) => (float[1, 3, h, w] street_images)
 }
 """
 
-# One level of its head, (1, 85, rows, columns): what lies in the picture, as rows of the head of ours.
+# One level of its head, (1, 85, rows, columns): the cells inside the picture, as rows of our head.
 _LEVEL = """
 level (float[1, 85, h, w] street_level, int64[2] street_size, bool[1] street_colour, float[80, c] street_classes)
   => (float[1, n, m] street_rows)
@@ -165,7 +165,7 @@ def join(aerial: Path, street: Path, out: Path) -> None:
 
 
 def _aerial_part(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The model without what an earlier `join` has added."""
+    """The model without the parts that an earlier `join` added."""
     graph, output = model.graph, model.graph.output[0].name
     parts = {name for node in graph.node if output in node.output for name in node.input}
     if _OWN not in parts:
@@ -207,7 +207,7 @@ def _levels_of(model: onnx.ModelProto, path: Path, *, opset: int) -> tuple[onnx.
     levels = [name for name, node in joined.items() if _is_level(node, graph)]
     if len(levels) != len(_STRIDES):
         raise UserError(f"{path} has {len(levels)} levels of box, objectness and classes; YOLOX-nano has 3")
-    # What stands behind them only puts them into one list.
+    # The nodes behind them only put them into one list.
     needed, nodes = set(levels), []
     for node in reversed(graph.node):
         if needed.intersection(node.output):

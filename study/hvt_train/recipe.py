@@ -61,7 +61,7 @@ _CREDITS = (
 
 
 def run_recipe(arguments: argparse.Namespace) -> None:
-    """Train what ``arguments.command`` names (``detector``, ``classifier`` or ``all``) into ``arguments.out``."""
+    """Train ``arguments.command`` (``detector``, ``classifier`` or ``all``) into ``arguments.out``."""
     cv2.setNumThreads(1)
     torch.set_num_threads(arguments.threads)
     out: Path = arguments.out
@@ -122,7 +122,7 @@ def _detector(arguments: argparse.Namespace, pool: list[Path]) -> None:
 
 
 def _calibrate(arguments: argparse.Namespace) -> None:
-    """Export the best weights again, with scores that say how often a box is right on what was held out."""
+    """Export the best weights again, with scores that say how often a box is right on held-out pictures."""
     path = (arguments.out / DETECTOR).with_suffix(".onnx")
     net = DetectorNet(len(CLASSES))
     net.load_state_dict(torch.load(path.with_suffix(".pt")))

@@ -1,1 +1,1 @@
-"""Paints what is there: ground, plants, the cast of vehicles and people (`CLASS_NAMES`), and their shadows."""
+"""Paints the scene: ground, plants, the cast of vehicles and people (`CLASS_NAMES`), and their shadows."""

@@ -107,7 +107,7 @@ class Canvas:
         patch[:] = np.clip(patch + grain[..., None], 0, 255).astype(np.uint8)
 
     def sprite(self, *, height_m: float) -> Sprite:
-        """What was drawn, with light that falls off towards the edges as on a rounded body."""
+        """The drawing, with light that falls off towards the edges as on a rounded body."""
         distance = cv2.distanceTransform((self.alpha > 127).astype(np.uint8), cv2.DIST_L2, 3)
         gain = 0.80 + 0.20 * np.minimum(distance * SPRITE_M_PER_PX / 0.16, 1.0)
         share = self.alpha / 255.0

@@ -156,7 +156,7 @@ class _Painter:
         )
 
     def shadows(self, layout: Layout) -> None:
-        """Darken what lies in the shade of buildings and trees."""
+        """Darken the shade of buildings and trees."""
         dx, dy = self._appearance.shadow_vector
         for building in layout.buildings:
             foot = np.array(building.rect.corners)
@@ -335,7 +335,7 @@ def _mix(first: Bgr, second: Bgr) -> Bgr:
 
 
 def _strips(rows: slice, columns: slice, *, height: int = 32) -> Iterator[tuple[slice, slice]]:
-    """The region in strips, for what needs many numbers a pixel."""
+    """The region in strips, for steps with many numbers a pixel."""
     for top in range(rows.start, rows.stop, height):
         yield slice(top, min(top + height, rows.stop)), columns
 

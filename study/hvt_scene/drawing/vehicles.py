@@ -1,7 +1,7 @@
 """Vehicles and people seen from above: one function a class, each drawing a varied sprite, nose to +x.
 
-The classes overlap in size, outline and paint on purpose. What tells them apart is fine: window rows, roof rails
-and ribs, planks and cargo in a bed, hatches and fans on a bus. At base resolution and bitrate that is what is lost.
+The classes overlap in size, outline and paint on purpose. Fine detail tells them apart: window rows, roof rails
+and ribs, planks and cargo in a bed, hatches and fans on a bus. Base resolution and bitrate lose it.
 """
 
 from __future__ import annotations
@@ -281,7 +281,7 @@ def _pedestrian(rng: _Rng) -> Sprite:
 
 
 def _other(rng: _Rng, *, small: bool) -> Sprite:
-    """What is no vehicle but looks like one: containers, flat trailers, skips."""
+    """Objects that are no vehicles but look like them: containers, flat trailers, skips."""
     kind = 2 if small else int(rng.integers(3))
     length, width = ((6.06, 2.44), (float(rng.uniform(6.5, 9)), 2.4), (float(rng.uniform(3.4, 4.4)), 1.85))[
         kind

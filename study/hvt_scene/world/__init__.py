@@ -1,1 +1,1 @@
-"""What is in the drawn world and where: the plan of streets, houses and fields, and the traffic on them."""
+"""The drawn world: the plan of streets, houses and fields, and the traffic on them."""

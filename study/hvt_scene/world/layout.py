@@ -106,7 +106,7 @@ def plan(rng: _Rng, appearance: Appearance) -> Layout:
 
 
 def _kinds(rng: _Rng) -> list[tuple[str, str]]:
-    """What stands in the four blocks (two plots each); a yard and two car parks are always near the middle."""
+    """The kinds of the four blocks (two plots each); a yard and two car parks are always near the middle."""
     near = ["parking", "parking", "yard", "roofs"]
     far = ["parking", "houses", "park", "court"]
     rng.shuffle(near)

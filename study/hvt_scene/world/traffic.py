@@ -1,4 +1,4 @@
-"""What moves: vehicles that follow their leader and the lights, cars that circle car parks, people on foot."""
+"""Moving objects: vehicles that follow their leader and the lights, cars that circle car parks, people on foot."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Calibration:
     slope: float = 1.0
     shift: float = 0.0
     confidence: float = 0.25
-    """Calibrated score from which on boxes should be shown: where F1 is best on what was held out."""
+    """Calibrated score from which on boxes should be shown: where F1 is best on the held-out pictures."""
 
 
 NONE = Calibration()
@@ -35,7 +35,7 @@ NONE = Calibration()
 def fit_calibration(detector: Detector, pictures: Iterable[HeldOut]) -> Calibration:
     """Fit to how often a box of a score is right: on a label, at IoU 0.5, whatever its class.
 
-    ``detector`` should show what it finds from a low confidence on (0.02).
+    ``detector`` should show boxes from a low confidence on (0.02).
     """
     scores, right, objects = [], [], 0
     for picture in pictures:

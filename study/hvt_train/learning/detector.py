@@ -150,7 +150,7 @@ class DetectorNet(nn.Module):
 
 
 class ExportedDetector(nn.Module):
-    """What goes into the ONNX file: the maps as YOLOX's raw head (N, A, 5 + C), scores as probabilities.
+    """The network of the ONNX file: its maps as YOLOX's raw head (N, A, 5 + C), scores as probabilities.
 
     ``slope`` and ``shift`` are those of a `calibration.Calibration`: objectness times the likeliest class is the
     calibrated score.

@@ -28,7 +28,7 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int]
     The file's convolutions have absorbed their batch norms, so that a norm's mean and variance are measured on
     ``images`` ((N, 3, H, W) float32 BGR 0…255), and scale and shift are set to undo them.
 
-    Blocks that YOLOX-nano has not keep what they began with where the file has them not either.
+    Blocks that YOLOX-nano lacks keep their first values where the file lacks them too.
 
     Raises `ValueError` where the file is of another architecture.
     """
@@ -72,7 +72,7 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int]
 
 
 def _loaded(net: nn.Module, layers: int) -> list[nn.Module]:
-    """What a file of so many layers has weights for: all (what was joined comes behind), or YOLOX-nano's."""
+    """The modules that a file of so many layers has weights for: all (joined ones come behind), or YOLOX-nano's."""
     modules = list(net.modules())
     if sum(isinstance(module, (nn.Conv2d, nn.Linear)) for module in modules) <= layers:
         return modules
@@ -83,7 +83,7 @@ def _loaded(net: nn.Module, layers: int) -> list[nn.Module]:
 def _chosen(
     layer: nn.Conv2d | nn.Linear, weight: np.ndarray, bias: np.ndarray, rows: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The file's rows in the order of ours; a class that the file has not keeps what it began with."""
+    """The file's rows in the order of ours; a class that the file lacks keeps its first values."""
     assert layer.bias is not None
     own_weight, own_bias = layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()
     for row, theirs in enumerate(rows):
@@ -111,7 +111,7 @@ _OPSET = 17
 def metadata(
     *, name: str, classes: Sequence[str], seed: int, commit: str, date: str, summary: str, **more: str
 ) -> dict[str, str]:
-    """What both files carry; ``names`` is read by `hvt_common.inference.labels`."""
+    """The metadata of both files; `hvt_common.inference.labels` reads ``names``."""
     return {
         "names": str(dict(enumerate(classes))),
         "classes": json.dumps(list(classes)),

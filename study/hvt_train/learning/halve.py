@@ -39,7 +39,7 @@ def unfolded(weight: np.ndarray) -> np.ndarray:
 
 
 def unfold_stem(graph: onnx.GraphProto, images: str) -> None:
-    """Let the graph's first convolution take ``images`` itself; what folded them is left without a use."""
+    """Let the graph's first convolution take ``images`` itself; the nodes that folded them lose their use."""
     weights = {one.name: one for one in graph.initializer}
     for node in graph.node:
         if node.op_type == "Conv" and node.input[1] in weights:

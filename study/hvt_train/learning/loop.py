@@ -37,7 +37,7 @@ class LoopSettings:
 
 
 class Average:
-    """Exponential moving average of a network's weights (Polyak); what is exported and measured."""
+    """Exponential moving average of a network's weights (Polyak), for export and measures."""
 
     def __init__(self, net: nn.Module, decay: float) -> None:
         self.net = copy.deepcopy(net).eval()
@@ -69,7 +69,7 @@ def train(
     """Train the network in place on batches without end, and return the averaged one.
 
     ``loss_of`` makes of (network, batch) a loss and its parts, ``check`` measures the averaged network at a step. The
-    log has one JSON object a line: step, seconds, rate and parts every 50 steps, and what ``check`` returns.
+    log has one JSON object a line: step, seconds, rate and parts every 50 steps, and the results of ``check``.
     """
     net.to(settings.device)
     optimizer = torch.optim.AdamW(

@@ -84,7 +84,7 @@ def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[st
 
 
 def _named(rows: Tensor, shapes: list[tuple[int, int]], targets: Targets) -> Tensor:
-    """Class ids in which what a set does not tell has the likeliest of `AMONG` by what the network says of it now."""
+    """Class ids in which a class that a set does not tell is the likeliest of `AMONG` by the network as it is now."""
     kinds = targets.class_ids.clone()
     which = torch.nonzero(kinds < -1)[:, 0]
     if len(which):
@@ -203,12 +203,12 @@ def _forgiving(count: int, grid: Tensor, stride: Tensor, pictures: Tensor, boxes
 
 
 _LIKE = {"van": "car", "motor": "motorcycle", "pedestrian": "person"}
-"""What of COCO's classes comes closest."""
+"""The closest class of COCO."""
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Pictures and what is in them."""
+    """Pictures and their objects."""
 
     images: torch.Tensor
     """(N, 3, H, W) uint8 BGR."""

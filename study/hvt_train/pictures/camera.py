@@ -1,8 +1,8 @@
-"""Unlabelled pictures of traffic cameras and streets: three detectors name what they agree on.
+"""Unlabelled pictures of traffic cameras and streets: three detectors name the objects that they agree on.
 
-What two are sure of, or the best of them alone by far, is an object; what one of them thinks possible counts neither
-way; the rest is ground. The best on such views is Open Model Zoo's person-vehicle-bike-detection-2003 (Apache-2.0);
-the others are YOLOX-nano, of the picture as it is and enlarged, and the aerial detector of before.
+A box that two are sure of, or the best of them by far, is an object; a box that one of them thinks possible counts
+neither way; the rest is ground. The best on such views is Open Model Zoo's person-vehicle-bike-detection-2003
+(Apache-2.0); the others are YOLOX-nano, of the picture as it is and enlarged, and the aerial detector of before.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SURE, _ALONE, _NAMED = 0.25, 0.42, 0.45
 _SAME, _LEAST_PX = 0.45, 4.0
 _SAME_DOUBT = 0.3
 _AT_ONE_PLACE, _STANDS, _MOVES = 0.65, 0.25, 0.6
-"""IoU of what is at one place; the share of a camera's pictures that have it there; from which score it may be."""
+"""IoU of boxes at one place; the share of a camera's pictures with one there; the least score of a real one there."""
 _POSSIBLE, _GROUND = 0.15, 0.1
 """From which the best one's box counts neither way, and the share of the picture beyond which none does."""
 
@@ -63,7 +63,7 @@ def unlabelled(folder: Path, *, of_a_clip: int = 34) -> Iterator[tuple[str, Imag
 
 
 class Teachers:
-    """Asks all three; each should show what it finds from .08 on. ``names`` are the classes of the best one."""
+    """Asks all three; each should show boxes from .08 on. ``names`` are the classes of the best one."""
 
     def __init__(self, best: Detector, nano: Detector, aerial: Detector, *, names: Sequence[str]) -> None:
         self._teachers = (
@@ -84,7 +84,7 @@ class Teachers:
         for place, part in _quarters(image):
             sides = np.array([part.shape[1], part.shape[0]])
             for one in _said(0, best, names, part, 1.0):
-                # What a quarter's inner edge cuts is whole in another one, or in the picture.
+                # A box that a quarter's inner edge cuts is whole in another one, or in the picture.
                 low, high = one.box_px[:2] < 2, one.box_px[2:] > sides - 2
                 if not (low & (place > 0) | high & (place + sides < size)).any():
                     shifted = one.box_px + np.tile(place, 2).astype(np.float32)
@@ -127,7 +127,7 @@ def _quarters(image: Image) -> Iterator[tuple[npt.NDArray[np.int64], Image]]:
 
 
 def agreed(said: Sequence[Said], *, area_px: float) -> tuple[Boxes, npt.NDArray[np.int32]]:
-    """Boxes and class ids of what was said about one picture of ``area_px``; -1 counts neither way."""
+    """Boxes and class ids from the answers on one picture of ``area_px``; -1 counts neither way."""
     left = sorted(
         (one for one in said if one.name in _GROUPS and (one.teacher or one.score >= _POSSIBLE)),
         key=lambda one: (one.teacher, -one.score),
@@ -153,7 +153,7 @@ def agreed(said: Sequence[Said], *, area_px: float) -> tuple[Boxes, npt.NDArray[
         (numbers >= 0) | (sides.prod(1) <= _GROUND * area_px) | (numbers < -1)
     )
     objects = found[counted & (numbers != -1)]
-    if len(objects):  # a doubt about what is an object says nothing
+    if len(objects):  # a doubt about a sure object says nothing
         counted &= (numbers != -1) | (iou(found, objects).max(1) <= _SAME_DOUBT)
     return found[counted], numbers[counted]
 

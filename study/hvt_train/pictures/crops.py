@@ -42,7 +42,7 @@ class Crops:
 
 
 def collect_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
-    """Up to ``most`` crops of what is well visible, rare classes first, and one of the ground as "other"."""
+    """Up to ``most`` crops of well visible objects, rare classes first, and one of the ground as "other"."""
     sides = (picture.boxes_px[:, 2:] - picture.boxes_px[:, :2]).max(1)
     known = picture.class_ids >= 0
     rows = np.nonzero(known & (picture.visible >= _LEAST_VISIBLE) & (sides >= _LEAST_SIDE_PX))[0]
@@ -62,7 +62,7 @@ def collect_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
 
 
 def real_crops(pool: list[Path], detector: Detector, *, most: int) -> Iterator[Crops]:
-    """Crops of real pictures, and as "other" what ``detector`` finds where no label is: its false alarms."""
+    """Crops of real pictures, and as "other" the false alarms of ``detector`` where no label is."""
     real = [path for path in pool if path.name.startswith(tuple(SETS))]
     for number, path in enumerate(real):
         rng = np.random.default_rng([TRAIN_SEED, 4, number])
@@ -76,7 +76,7 @@ def real_crops(pool: list[Path], detector: Detector, *, most: int) -> Iterator[C
 
 
 def _empty_box(picture: Picture, rng: _Rng) -> npt.NDArray[np.float32] | None:
-    """A box of a vehicle's size where nothing is: what a false detection would bring."""
+    """A box of a vehicle's size where nothing is, like a false detection."""
     high, wide = picture.image_bgr.shape[:2]
     size = np.exp(rng.uniform(np.log(16), np.log(120), 2))
     low = rng.uniform(0, np.maximum(np.array([wide, high]) - size, 1))
@@ -127,7 +127,7 @@ def held_out_crops(seeds: range, *, moments: int, quality_pct: int = 65) -> Iter
 def held_out_real_crops(
     data: Path, detector: Detector, *, quality_pct: int = 65
 ) -> Iterator[tuple[Image, str]]:
-    """Stills of held-out real pictures, and as "other" what ``detector`` finds where no label is."""
+    """Stills of held-out real pictures, and as "other" the finds of ``detector`` where no label is."""
     other = CLASS_NAMES.index("other")
     for picture in held_out_labelled(data):
         yield from _stills(picture, quality_pct)

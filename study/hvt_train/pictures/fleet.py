@@ -1,4 +1,4 @@
-"""What stands and drives in a place: one function a class, each making a varied `Solid`."""
+"""The objects of a place: one function a class, each making a varied `Solid`."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def _ring(x: float, y: float, radii: tuple[float, float]) -> Points:
 
 
 def _person(part: Part, rng: _Rng, *, z: tuple[float, float, float], x: float = 0.0) -> None:
-    """Torso and head on what carries them; ``z`` are hips, shoulders and crown."""
+    """Torso and head on legs or a vehicle; ``z`` are hips, shoulders and crown."""
     shirt, hair = random_paint(rng), lit((60.0, 80.0, 110.0), float(rng.uniform(0.3, 1.8)))
     radii = (float(rng.uniform(0.13, 0.2)), float(rng.uniform(0.2, 0.29)))
     torso = _ring(x, 0, radii)

@@ -1,4 +1,4 @@
-"""The classes of ``aerial-nano``, and what a set may leave open."""
+"""The classes of ``aerial-nano``, and the choices that a set may leave open."""
 
 from __future__ import annotations
 
@@ -15,4 +15,4 @@ AMONG = {
     VEHICLE: {ID["car"]: 1.0, ID["van"]: 0.0, ID["truck"]: 0.0, ID["bus"]: 0.0},
     BIKE: {ID["motor"]: 0.5, ID["bicycle"]: 0.0},
 }
-"""What it may be, and how much (in logits) each is favoured."""
+"""The classes that it may be, and how much (in logits) each is favoured."""

@@ -51,7 +51,7 @@ class _Occupancy:
 
 
 def settle(rng: _Rng, surface: Surface) -> list[Thing]:
-    """Decide what stands where, and tell the ground what belongs under it."""
+    """Decide the place of each object, and tell the ground which surface belongs under it."""
     taken = _Occupancy(surface.half_m)
     things: list[Thing] = []
 
@@ -194,7 +194,7 @@ def _building(rng: _Rng) -> Solid:
 
 
 def _clutter(rng: _Rng) -> Solid:
-    """Posts, bins, benches, boxes, bushes, parasols: plain, so that a vehicle's inner pattern is what counts."""
+    """Posts, bins, benches, boxes, bushes, parasols: plain, so that a vehicle's inner pattern decides."""
     high = float(rng.uniform(0.1, 3.0))
     level = rng.uniform(20, 245)
     tone = tuple(float(c) for c in np.clip(level + rng.normal(0, 30, 3), 5, 250))

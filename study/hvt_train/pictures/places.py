@@ -1,7 +1,7 @@
 """Places that the demo scene does not have: any ground, rows as tight as in a real car park, any tilt and lean.
 
 A place is drawn as one large picture from which training cuts many views. The camera is a pinhole over the point
-``nadir``; what stands z metres high is drawn ``z * lean`` pixels away from its foot, away from that point, and the
+``nadir``; a point z metres high is drawn ``z * lean`` pixels away from its foot, away from the nadir, and the
 ground is foreshortened along the direction of the tilt. That is exact for a distant camera and near enough for ours.
 """
 
@@ -27,7 +27,7 @@ _SHIFT = 4
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture with what is in it, as parallel arrays."""
+    """A picture with its objects, as parallel arrays."""
 
     image_bgr: Image
     boxes_px: Boxes

@@ -107,7 +107,7 @@ def thin_kbps(rng: np.random.Generator) -> float:
 
 
 def fill_pool(folder: Path, plan: PoolPlan, *, workers: int = 1) -> list[Path]:
-    """Draw what is missing in ``folder`` and return all files of the plan, in the order of their names."""
+    """Draw the missing files in ``folder`` and return all files of the plan, in the order of their names."""
     folder.mkdir(parents=True, exist_ok=True)
     counts = {"demo": plan.scenes, "codes": plan.codes, "place": plan.places, "aslant": plan.aslant}
     jobs = [

@@ -1,4 +1,4 @@
-"""Real labelled pictures for the pool: five public sets, each with what it labels and what it leaves out.
+"""Real labelled pictures for the pool: five public sets, each with its labels and its omissions.
 
 Every picture goes through x265 at 80 to 1400 kbps (of a 1280x720 base) or stays clean, and is kept as one file of the
 pool. ``class_ids`` beyond the classes: -1 is neither object nor background, `LARGE_VEHICLE` is a van,
@@ -57,7 +57,7 @@ _Labelled = tuple[Path, npt.NDArray[np.float32], npt.NDArray[np.int32]]
 def fill_real(folder: Path, data: Path, *, seed: int = 1, teachers: Teachers | None = None) -> list[Path]:
     """Put the sets that lie under ``data`` (``kit_ais``, ``hit_uav``, ``cats_madison`` …) into the pool ``folder``.
 
-    Flights and sequences that are held out for measuring are left out. What is there already stays. With
+    Flights and sequences that are held out for measuring are left out. Files that are there already stay. With
     ``teachers`` the clips of ``street`` and the pictures of ``camera`` too.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -161,7 +161,7 @@ def _thermal(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
 def _road(data: Path) -> Iterator[_Labelled]:
     """Madison: vehicles, the small ones as cars, and the people that we marked (``madison_people.csv``).
 
-    Only pictures of views that hover long enough to tell what moves are taken: there, who walks is marked.
+    Only pictures of views that hover long enough to tell moving objects are taken: there, walking people are marked.
     """
     marks: dict[str, list[tuple[int, list[float]]]] = {}
     with resources.files("hvt_train.pictures").joinpath("madison_people.csv").open(encoding="utf-8") as file:

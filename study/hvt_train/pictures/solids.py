@@ -20,12 +20,12 @@ Colour = tuple[float, float, float]
 """B, G, R in 0…255."""
 
 TYRES: Colour = (26.0, 26.0, 26.0)
-"""What is black and lowest on every vehicle."""
+"""The black, lowest part of every vehicle."""
 
 
 @dataclass(slots=True)
 class Part:
-    """A convex piece: faces in an order in which each may hide what comes before it."""
+    """A convex piece: faces in an order in which each may hide earlier ones."""
 
     x: float
     """Where it stands along the body, for the order among parts."""
@@ -85,7 +85,7 @@ class Solid:
 
 
 def random_paint(rng: _Rng) -> Colour:
-    """What cars are painted: mostly white, black and greys, some colours of any hue."""
+    """A colour of cars: mostly white, black and greys, some colours of any hue."""
     draw = rng.random()
     if draw < 0.68:
         level = float(rng.choice([238, 225, 190, 150, 110, 75, 45, 30, 22])) * float(rng.uniform(0.85, 1.06))

@@ -24,7 +24,7 @@ _MATERIALS: dict[str, tuple[float, float, float]] = {
 
 
 class Surface:
-    """What lies where in a square picture of ``size`` pixels, in world metres, to be painted later."""
+    """The surfaces of a square picture of ``size`` pixels, in world metres, to be painted later."""
 
     def __init__(
         self, to_px: Callable[[_Floats], _Floats], *, size: int, px_per_m: float, half_m: float

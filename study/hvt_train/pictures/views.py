@@ -67,7 +67,7 @@ class ViewSettings:
     )
     """How often each kind of picture is taken."""
     tiled: float = 0.3
-    """How often a view is put together of four or nine smaller ones: what is small stands among others."""
+    """How often a view is put together of four or nine smaller ones: small objects stand among others."""
     least_visible: float = 0.3
     least_side_px: float = 4.0
     """Of the longer side of a box, in pixels of the view."""
@@ -101,7 +101,7 @@ class ViewSource:
         return View(image, np.concatenate(boxes).astype(np.float32), np.concatenate(kinds))
 
     def _view(self, side: int, smaller: float) -> View:
-        """One window of ``side`` pixels; what is in it is shown ``smaller`` than alone."""
+        """One window of ``side`` pixels; its objects are shown ``smaller`` than alone."""
         rng = self._rng
         kind = str(rng.choice(self._kinds, p=self._shares))
         files = self._files[kind]
