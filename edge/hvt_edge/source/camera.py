@@ -30,14 +30,14 @@ _Y16 = cv2.VideoWriter.fourcc(*"Y16 ")
 class CameraGrabber:
     """One V4L2 device: ``path`` is /dev/videoN, ``fps`` is requested of the camera.
 
-    ``clock`` is that of the source's other times: a wall clock that was set since would say another time.
+    ``clock`` is the clock of the source's other times: a wall clock that was set since would give another time.
     """
 
     def __init__(self, path: str, *, fps: float, clock: Callable[[], int]) -> None:
         self.name = path
         self.notes = Notes(path)
         self._deep = False
-        """It gives sixteen bits of grey."""
+        """The camera gives sixteen bits of grey."""
         self._stretch = Stretch(self.notes)
         self._fps = fps
         self._clock = clock
@@ -63,7 +63,7 @@ class CameraGrabber:
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, _REQUESTED_SIZE[1])
         capture.set(cv2.CAP_PROP_FPS, self._fps)
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        # OpenCV would keep the upper eight of sixteen bits, in which a warm body is one level above the rest.
+        # OpenCV would keep the upper eight of sixteen bits, in which a warm body is one level above the background.
         self._deep = round(capture.get(cv2.CAP_PROP_FOURCC)) == _Y16
         if self._deep:
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
@@ -74,7 +74,7 @@ class CameraGrabber:
         self.open()
 
     def grab(self) -> Shot:
-        """The next frame, at most the read timeout from now, with the time that the driver gave its buffer."""
+        """The next frame, at most the read timeout from now, with the driver's time stamp of its buffer."""
         capture = self._capture
         if capture is None or not capture.grab():
             raise SignalLost("the camera delivers no frame")
@@ -88,7 +88,7 @@ class CameraGrabber:
             shape = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
             return self._stretch.bgr(_levels(image, shape), at_s=time.monotonic())
 
-        # The driver stamps its buffers by the monotonic clock, which stands while the machine sleeps; or by none: 0.
+        # The driver stamps buffers by the monotonic clock, which stops while the machine sleeps; or not at all: 0.
         buffer_ms, ahead_ns = capture.get(cv2.CAP_PROP_POS_MSEC), self._clock() - time.monotonic_ns()
         return Shot(image, ahead_ns + round(buffer_ms * 1e6) if buffer_ms > 0 else None)
 
@@ -99,7 +99,7 @@ class CameraGrabber:
 
 
 def _levels(raw: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
-    # Sixteen-bit levels out of what OpenCV does not convert: the levels, or their bytes in a row.
+    # Sixteen-bit levels from OpenCV's unconverted frame: the levels, or their bytes in a row.
     count = 2 * math.prod(shape)
     data = np.ascontiguousarray(raw).view(np.uint8).reshape(-1)
     if data.size < count:

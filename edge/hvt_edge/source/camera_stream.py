@@ -30,7 +30,7 @@ _HVCC_HEADER_BYTES = 22
 _FIRST_OF_PICTURE = 0x80
 """``first_slice_segment_in_pic_flag``, the first bit of a slice's header (H.265, clause 7.3.6.1)."""
 _MOST_SETS, _MOST_SET_BYTES = 32, 4096
-"""A camera has one of each kind; more than this is no camera's."""
+"""Limits: a camera has one parameter set of each kind, and never this many or this large."""
 _DELIMITER, _SLICES_END = 35, 32
 """The NAL unit types of an access unit delimiter, and behind the last of a slice (H.265, table 7-1)."""
 
@@ -40,9 +40,9 @@ class CameraUnits:
 
     A file in MP4 or Matroska writes lengths in place of start codes and has its parameter sets once, in a header
     (hvcC, ISO/IEC 14496-15, 8.3.2.1.2); a camera may send them once, in the description of its RTSP stream. A ground
-    that joins later would wait for them for ever. So they are put before each keyframe that comes without. Filler,
-    with which a camera keeps a constant rate, goes; all else stays. ``header`` is the container's or the stream's
-    description before the first packet.
+    that joins later would wait for them for ever. So they are put before each keyframe that comes without them.
+    Filler, with which a camera keeps a constant rate, is removed; all else stays. ``header`` is the container's or
+    the stream's description before the first packet.
     """
 
     def __init__(self, header: bytes) -> None:
@@ -73,7 +73,7 @@ class CameraUnits:
         return CameraUnit(self._with_sets(data, nals), keyframe=True)
 
     def _with_sets(self, data: bytes, nals: list[bytes]) -> bytes:
-        # The keyframe with all its sets, in order: behind the delimiter, which is the first where there is one.
+        # The keyframe with all its sets, in order: behind the delimiter, which comes first where there is one.
         if self._sets.keys() != PARAMETER_SETS:
             raise ValueError("a keyframe has no VPS, SPS and PPS, and none came before it")
         sets = b"".join(LONG_START + one for kind in sorted(self._sets) for one in self._sets[kind])
@@ -90,7 +90,7 @@ class CameraUnits:
 
 
 def _hvcc(header: bytes) -> tuple[int, list[bytes]]:
-    # How many bytes a length has, and the parameter sets. `ValueError` for a header that breaks off.
+    # The number of bytes of a length, and the parameter sets. `ValueError` for a header that breaks off.
     if len(header) <= _HVCC_HEADER_BYTES:
         raise ValueError("the header of its HEVC stream breaks off")
     sets: list[bytes] = []
@@ -123,13 +123,13 @@ REENCODE = "re-encode it with --encoder x265"
 _FORMATS = frozenset({"yuv420p", "yuvj420p"})
 """4:2:0 in 8 bits; the second is FFmpeg's name for the same in full range."""
 LONG_STEP_S, _LONG_STEPS = 1.0, 3
-"""From one frame to the next: more than both, in seconds and in usual steps, is a jump of the time stamps."""
+"""A step from one frame to the next of more than both, in seconds and in usual steps, is a jump of the stamps."""
 _OTHER_MATRICES = frozenset({4, 5, 6, 7, 9})
 """Other matrices of ITU-T H.273, table 4: BT.601 in its variants, SMPTE 240M and BT.2020."""
 
 
 def without_jumps(units: Sequence[SeenUnit]) -> tuple[SeenUnit, ...]:
-    """The units from time 0 on. A step back in time, or one that no frame takes, becomes the usual one (the median).
+    """The units from time 0 on. A step back in time, or one too long for a frame, becomes the usual one (the median).
 
     Such a step is a clock that was set or ran over, packets that were lost, or two recordings put together.
     """
@@ -142,9 +142,9 @@ def without_jumps(units: Sequence[SeenUnit]) -> tuple[SeenUnit, ...]:
 
 
 def rate_of(name: str, units: Sequence[SeenUnit], *, said: float | None) -> float:
-    """Frames a second. What the container says counts where its time stamps bear it out within 2 %.
+    """Frames a second. The container's rate counts if its time stamps agree with it within 2 %.
 
-    Raises `UserError` where they say nothing, or what no base stream can have.
+    Raises `UserError` if they give no rate, or one that no base stream can have.
     """
     span_s = without_jumps(units)[-1].at_s
     fps = (len(units) - 1) / span_s if span_s > 0 else said or 0.0
@@ -159,28 +159,28 @@ def rate_of(name: str, units: Sequence[SeenUnit], *, said: float | None) -> floa
 
 
 class CameraDecoder:
-    """Takes packets in their order; gives each unit that can be sent with its picture. One thread.
+    """Takes packets in their order; returns each unit that can be sent with its picture. One thread.
 
-    What does not hold is left out up to the next keyframe, as a ground would have to.
+    A damaged unit is left out with all units up to the next keyframe, as a ground would have to.
     """
 
     def __init__(self, units: CameraUnits) -> None:
         self._units = units
-        self._decoder = BaseDecoder()  # of any size: of a larger one it would say no more than that it fails
+        self._decoder = BaseDecoder()  # of any size: with a size it would only fail at a larger picture
         self._size: tuple[int, int] | None = None
         self._whole = False
-        """Whether all since a keyframe was decoded."""
+        """Whether all units since a keyframe were decoded."""
         self.trouble = ""
         """The fault of the newest unit that was left out, in a few words."""
         self.is_other = False
-        """Whether that one is whole, and of another size or format than is taken."""
+        """Whether that unit is intact, but of another size or format than is accepted."""
 
     def expect(self, size: tuple[int, int] | None) -> None:
-        """From now on a picture of another size (width, height) is not taken."""
+        """From now on a picture of another size (width, height) is not accepted."""
         self._size = size
 
     def skip(self) -> None:
-        """Packets are missing before the next."""
+        """Note that packets are missing before the next one."""
         self._whole = False
 
     def decode(self, packet: bytes) -> tuple[CameraUnit, YuvPicture] | None:
@@ -212,7 +212,7 @@ class CameraDecoder:
 
 
 def open_units(name: str, stream: Any) -> CameraUnits:
-    """For the packets of an open stream. Raises `UserError` where its header is damaged."""
+    """The converter of an open stream's packets. Raises `UserError` where its header is damaged."""
     try:
         return CameraUnits(stream.codec_context.extradata or b"")
     except ValueError as error:
@@ -246,7 +246,7 @@ def check_stream(name: str, stream: Any) -> None:
 def check_picture(name: str, picture: av.VideoFrame, *, size: BaseSize) -> str:
     """Raise `UserError` where a picture is not shown as it is coded, or has another size than is requested.
 
-    Return what else will look different at the ground, as a sentence; empty for nothing.
+    Return the other differences that a ground will see, as a sentence; empty for none.
     """
     has = (picture.width, picture.height)
     wanted = size(has) if callable(size) else size

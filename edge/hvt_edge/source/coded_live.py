@@ -1,7 +1,7 @@
 """An HEVC camera whose own units are the base stream: packets in a queue, in order, decoded as they are taken.
 
-Of pictures only the newest counts (`hvt_edge.source.live`); of units each builds on the one before. So none is left
-out while the queue holds, and where it does not, all up to the next keyframe.
+Of pictures only the newest counts (`hvt_edge.source.live`); each unit builds on the one before. So none is left
+out while the queue holds them, and when it overflows all units up to the next keyframe are.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource,
 from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, packets_of
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
-"""A camera is surveyed before the flight until its second keyframe, within these."""
+"""A camera is surveyed before the flight until its second keyframe, within these bounds."""
 MOST_OTHER_NS = 10 * SECOND_NS
 """A camera that sends pictures of another size or format for longer does not return to those of the start."""
 QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
@@ -41,9 +41,9 @@ class CodedStreamGrabber(StreamGrabber):
     """The packets of an HEVC stream, not decoded."""
 
     size: tuple[int, int] | None = None
-    """(width, height) of what is taken; None before the first picture."""
+    """(width, height) of accepted pictures; None before the first."""
     said_fps: float | None = None
-    """The rate that the stream's description says."""
+    """The rate in the stream's description."""
 
     def _read(self, container: Any, stream: Any) -> Iterator[Shot]:
         check_stream(self.name, stream)
@@ -72,7 +72,7 @@ def _picture(packet: CameraPacket) -> Image:
 @dataclass(frozen=True, slots=True)
 class _Queued:
     number: int
-    """Counts the camera's packets; a missing one was lost here."""
+    """Number of the camera's packet; a gap was lost here."""
     capture_ns: int
     packet: CameraPacket
 
@@ -101,7 +101,7 @@ class CodedLiveSource(LiveSource):
         super().__init__(grabber, replace(settings, fps=1.0), clock=clock, failures=failures)
 
     def steps(self, *, start_ns: int) -> Iterator[Frame | None]:  # noqa: ARG002 - a camera has its own time
-        """See `Source`. The first is a keyframe."""
+        """See `Source`. The first frame is a keyframe."""
         first = newest = None
         decoder: CameraDecoder | None = None
         count = 0
@@ -147,7 +147,7 @@ class CodedLiveSource(LiveSource):
         return self._resizer.coded_frame(picture.bgr(), unit, index=index, capture_ns=item.capture_ns)
 
     def _check_other(self, decoder: CameraDecoder, now_ns: int) -> None:
-        # A new start takes what the camera sends now.
+        # A new start accepts the size and format that the camera sends now.
         if not decoder.is_other:
             self._other_since_ns = None
             return
@@ -178,7 +178,7 @@ class CodedLiveSource(LiveSource):
             self._news.notify_all()
 
     def _first_size(self, grabber: Grabber, size: BaseSize) -> tuple[int, int]:
-        # Look at the camera until its second keyframe.
+        # Survey the camera until its second keyframe.
         assert isinstance(grabber, CodedStreamGrabber), "the constructor takes no other"
         seen: list[SeenUnit] = []
         began_s, trouble = time.monotonic(), "no keyframe came"

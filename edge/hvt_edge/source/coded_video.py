@@ -40,7 +40,7 @@ _MOST_SURVEY_S, _MOST_SURVEYED = 600.0, 40_000
 
 
 class CodedVideoSource(ClipSource):
-    """A clip by presentation time, from its first keyframe on. Nothing is left out: its rate is the base rate.
+    """A clip by presentation time, from its first keyframe on. No frame is left out: its rate is the base rate.
 
     Raises `UserError` where its units cannot be the base stream.
     """
@@ -103,7 +103,7 @@ class CodedVideoSource(ClipSource):
                 if not begun:
                     begun, zero_s, before = True, at_s, left_out
                 unit, picture = decoded
-                # Two pictures of one time would be one to everybody.
+                # Two pictures with one time would count as one at the ground.
                 last_ns = max(last_ns + 1, round((at_s - zero_s) * SECOND_NS))
                 yield self._resizer.coded_frame(
                     picture.bgr(), unit, index=count + left_out - before, capture_ns=start_ns + last_ns
@@ -116,10 +116,12 @@ class CodedVideoSource(ClipSource):
     def _timed(
         self, container: Any, stream: Any, *, say: bool = False
     ) -> Generator[tuple[float, bytes], None, None]:
-        # (seconds, packet) in order; a jump of the time stamps is mended, and told of in the log if ``say``.
+        # (seconds, packet) in order; a jump of the time stamps is mended, and logged if ``say``.
         timeline = self._stamps.timeline(stream)
         for packet in packets_of(container, stream):
-            if isinstance(packet, Exception) or not packet.size:  # what breaks off is played up to there
+            if (
+                isinstance(packet, Exception) or not packet.size
+            ):  # a file that breaks off is played up to there
                 continue
             self._hidden += packet.is_discard
             usable = self._stamps.usable and packet.pts is not None

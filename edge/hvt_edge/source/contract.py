@@ -1,4 +1,4 @@
-"""The contract of a source, what it notes of itself, and the sizes and rates that a base stream can have."""
+"""The contract of a source, its notes, and the sizes and rates that a base stream can have."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hvt_common.runtime.log import START_LOGGER
 from hvt_common.values import Fit, Frame, View
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
-"""(width, height) of the base frames, or how they follow from those of the source."""
+"""(width, height) of the base frames, or a function that gives it from the source's."""
 
 _LEAST_SIDE_PX, _MOST_SIDE_PX = 64, 8192
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceSettings:
-    """How every kind of source is opened; see `hvt_edge.source.opening.open_source`."""
+    """Settings for opening every kind of source; see `hvt_edge.source.opening.open_source`."""
 
     size: BaseSize
     fps: float
@@ -34,18 +34,18 @@ class SourceSettings:
 
 @dataclass(frozen=True, slots=True)
 class SeenUnit:
-    """One access unit that was looked at before the flight."""
+    """One access unit that was surveyed before the flight."""
 
     at_s: float
     """The camera's time stamp, from its first unit on."""
     size_bytes: int
-    """With the parameter sets that a keyframe is given."""
+    """Size with the parameter sets that are put before a keyframe."""
     keyframe: bool
 
 
 @dataclass(frozen=True, slots=True)
 class CameraStream:
-    """The stream as measured before the flight: of a file its first minutes, of a camera some seconds."""
+    """The stream as measured before the flight: the first minutes of a file, some seconds of a camera."""
 
     units: tuple[SeenUnit, ...]
     """The first is a keyframe."""
@@ -54,7 +54,7 @@ class CameraStream:
 
     @property
     def keyframe_s(self) -> float:
-        """From one keyframe to the next at the longest; where there was no second one, how long was looked for it."""
+        """The longest time from one keyframe to the next; without a second one, the time surveyed."""
         times = [unit.at_s for unit in self.units if unit.keyframe]
         return max(
             (later - earlier for earlier, later in pairwise([*times, self.units[-1].at_s])), default=0.0
@@ -71,7 +71,7 @@ class Source(ABC):
     fps: float
     """Base rate, frames a second. A live camera that is slower delivers fewer."""
     frame_count: int | None
-    """How many base frames to expect, where that is known."""
+    """The number of base frames to expect, where that is known."""
     class_names: tuple[str, ...] = ()
     """Names of the classes in the ground truth; only the demo has any."""
     missed: int = 0
@@ -83,8 +83,8 @@ class Source(ABC):
     restarts: int = 0
     """How often a live source was opened again."""
     camera_stream: CameraStream | None = None
-    """The camera's own HEVC, where each frame comes with its unit of it (`Frame.camera_unit`). An index that is left
-    out is a unit that was lost."""
+    """The survey of the camera's own HEVC, if each frame comes with its unit of it (`Frame.camera_unit`). A missing
+    index is a unit that was lost."""
     notes: tuple[str, ...] = ()
     """The decisions and guesses about it before the flight and their reasons, a sentence each."""
     warning: str = ""
@@ -103,7 +103,7 @@ class Source(ABC):
         yield from self.frames(start_ns=start_ns)
 
     def close(self) -> None:
-        """Let go of devices and threads; calling it twice does no harm."""
+        """Release devices and threads; calling it twice does no harm."""
         return
 
     def __enter__(self) -> Self:
@@ -161,7 +161,7 @@ def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) 
 
 
 class Notes:
-    """Takes sentences; ``name`` is their subject, as it may be printed."""
+    """Collects sentences; ``name`` is their subject, as it may be printed."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -169,7 +169,7 @@ class Notes:
         self._taken = False
 
     def __call__(self, sentence: str) -> None:
-        """Keep it, each once; after `taken` it is logged at once."""
+        """Add the sentence, each once; after `taken` it is logged at once."""
         if sentence in self._said:
             return
         self._said.append(sentence)

@@ -1,4 +1,4 @@
-"""The drawn demo scene as a source. Who draws it says so by the entry point ``demo`` in the group ``hvt.scenes``.
+"""The drawn demo scene as a source. A package offers one by the entry point ``demo`` in the group ``hvt.scenes``.
 
 ``demo:codes`` has codes painted on roofs, to be read; ``demo:4k`` has 3840x2160 pixels; ``demo:codes,4k`` both.
 
@@ -51,7 +51,7 @@ def demo_scene(spec: str) -> dict[str, Any]:
 
 
 class DrawnScene(Protocol):
-    """The edge's view of a drawn scene; made by ``scene(seed)``, or with the arguments of `demo_scene` beside it."""
+    """The edge's view of a drawn scene; made by ``scene(seed)``, or with the further arguments of `demo_scene`."""
 
     size: tuple[int, int]
     """(width, height) of its pictures in pixels."""
@@ -75,13 +75,13 @@ class DemoSource(Source):
     """The demo scene from its beginning to its end, at the base rate.
 
     The frame at ``index`` shows the scene at the moment ``index / fps``. Raises `UserError` where no scene is
-    installed, or ``spec`` is none that `demo_scene` knows.
+    installed, or `demo_scene` does not accept ``spec``.
     """
 
     live = False
 
     def __init__(self, spec: str, settings: SourceSettings, *, seed: int) -> None:
-        demo_scene(spec)  # says what is wrong with it here
+        demo_scene(spec)  # names the fault here
         if not entry_points(group="hvt.scenes", name="demo"):
             raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
         self._drawing = subprocess.Popen(  # noqa: S603 - our own module
@@ -93,7 +93,7 @@ class DemoSource(Source):
         self._end = weakref.finalize(self, _end, self._drawing)
         self._size: tuple[int, int]
         self._pictures_due = 0
-        """Asked for, and not yet taken."""
+        """Requested pictures that were not taken yet."""
         self._size, self.class_names, duration_s = self._answer()
         self.fps = settings.fps
         self._resizer = Resizer(self._size, settings.size, fit=settings.fit)
@@ -124,7 +124,7 @@ class DemoSource(Source):
         return poses
 
     def close(self) -> None:
-        """End the drawing; a source that is forgotten ends it too."""
+        """End the drawing; garbage collection of the source ends it too."""
         self._end()
 
     def _request(self, *request: Any) -> None:
@@ -169,7 +169,7 @@ def _end(drawing: subprocess.Popen[bytes]) -> None:
 def _draw(seed: int, spec: str) -> None:
     (entry,) = entry_points(group="hvt.scenes", name="demo")
     scene: DrawnScene = entry.load()(seed, **demo_scene(spec))
-    # Not `sys.stdout.buffer`: with PYTHONUNBUFFERED it has no buffer, and a signal cuts what it writes short.
+    # Not `sys.stdout.buffer`: with PYTHONUNBUFFERED it has no buffer, and a signal cuts its writes short.
     answers = io.BufferedWriter(io.FileIO(sys.stdout.fileno(), "w", closefd=False))
     requests = sys.stdin.buffer
     pickle.dump((scene.size, scene.class_names, scene.duration_s), answers)
@@ -197,7 +197,7 @@ def check_truth(path: Path | None, source: Source) -> None:
 
 
 def write_truth_of(source: Source, path: Path | None, *, fps: float) -> None:
-    """Write the demo's ground truth, where it is requested."""
+    """Write the demo's ground truth, if it is requested."""
     if path is not None and isinstance(source, DemoSource):
         source.write_truth(path, fps=fps)
 

@@ -23,14 +23,14 @@ from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns,
 _log = logging.getLogger(__name__)
 
 _MOSTLY = 0.5
-"""Of the steps from one number to the next, so many have to be 1 for others to be gaps."""
+"""Share of the steps from one number to the next that must be 1 for others to be gaps."""
 _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"})
 
 
 def sequence_files(folder: Path) -> list[Path]:
-    """The images of a folder in natural order (img2 before img10); hidden files and subfolders are not looked at.
+    """The images of a folder in natural order (img2 before img10), without hidden files and subfolders.
 
-    Of names that are times 9.05 comes before 9.5. Raises `UserError` for a folder that may not be read.
+    Of names that are times 9.05 comes before 9.5. Raises `UserError` for a folder that cannot be read.
     """
     try:
         files = [file for file in folder.iterdir() if names_picture(file) and file.is_file()]
@@ -39,7 +39,7 @@ def sequence_files(folder: Path) -> list[Path]:
     times = [re.fullmatch(r"(.*?)([0-9]+)\.([0-9]+)", file.stem) for file in files]
     found = [(one[1], int(one[2]), one[3]) for one in times if one]
     least = min((len(fraction) for *_, fraction in found), default=0)
-    # A counter behind the dot has as many digits always where one has a zero before it.
+    # A counter behind the dot always has as many digits where one begins with a zero.
     if len(found) == len(files) and any(one[0] == "0" and len(one) > least for *_, one in found):
         return [file for _, file in sorted(zip(found, files, strict=True))]
     return sorted(files, key=lambda file: _natural(file.name))
@@ -67,9 +67,9 @@ def _gaps(files: list[Path]) -> str:
 
 
 def pages_of(file: Path) -> str:
-    """That a file holds more than one picture, in words; empty where it does not."""
+    """A note that a file holds more than one picture; empty where it does not."""
     count = 0
-    with suppress(cv2.error):  # its header says what no memory holds
+    with suppress(cv2.error):  # its header claims a size that no memory holds
         count = cv2.imcount(str(file))
     return f"{file.name} holds {count} pictures: of a file the first alone is shown" if count > 1 else ""
 
@@ -135,7 +135,7 @@ class FolderSource(Source):
 
 
 def _bgr(file: Path, stretch: Stretch, *, at_s: float) -> Image | None:
-    # ``at_s`` is when it is shown. Deep grey is a sensor's levels.
+    # ``at_s`` is the time at which it is shown. Deep grey is a sensor's levels.
     try:
         data = np.fromfile(file, np.uint8)
         if not data.size:
@@ -143,8 +143,11 @@ def _bgr(file: Path, stretch: Stretch, *, at_s: float) -> Image | None:
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
         if image is not None and image.itemsize > 1 and image.ndim == 2:
             return stretch.bgr(image, at_s=at_s)
-        # All else as OpenCV takes it: without transparency, in 8 bits, turned as its EXIF data say.
+        # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):  # it was there a moment ago, or its header says what no memory holds
+    except (
+        OSError,
+        cv2.error,
+    ):  # it was there a moment ago, or its header claims a size that no memory holds
         return None
     return None if image is None else np.asarray(image, np.uint8)

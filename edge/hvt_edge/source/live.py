@@ -1,6 +1,6 @@
-"""Live sources: a reader thread keeps the latest frame of a camera or a network stream.
+"""Live sources: a reader thread holds the latest frame of a camera or a network stream.
 
-Where frames come in bursts, as over UDP through a radio, it keeps those of one burst.
+Where frames come in bursts, as over UDP through a radio, it holds the frames of one burst.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ _JOIN_S = 1.5
 IDLE_S = 1.0
 LEAST_PATIENCE_S, _MOST_PATIENCE_S = 2.0, 10.0
 _MOST_PENDING = 8
-"""Frames of a burst that are kept."""
+"""Most frames of a burst that are held."""
 _STEADY_NS = 2 * SECOND_NS
-"""Where none was missed for so long, one more may wait than the newest: a keyframe is dear to code."""
+"""After this time without a missed frame, one may wait beside the newest: a keyframe is slow to code."""
 SOURCE_PART = "source"
-"""Its name as a failed part."""
+"""The source's name among failed parts."""
 
 
 def patience_s(fps: float) -> float:
-    """Without anything for so long a camera is gone: for two frames of ``fps``, within bounds."""
+    """Time without a frame after which a camera is gone: two frames of ``fps``, within bounds."""
     return min(_MOST_PATIENCE_S, max(LEAST_PATIENCE_S, 2 / fps))
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPacket:
-    """A frame as the camera has coded it; packets of one decoder come in order, and it is given each."""
+    """A frame as coded by the camera; packets of one decoder come in order, and it needs each of them."""
 
     data: bytes
     at_s: float | None
@@ -57,9 +57,9 @@ class Shot:
 
     image: Callable[[], Image]
     camera_ns: int | None = None
-    """When it was taken by the camera's own clock, Unix nanoseconds; None where it does not say."""
+    """Capture time by the camera's own clock, Unix nanoseconds; None where it gives none."""
     packet: CameraPacket | None = None
-    """For ``--encoder passthrough``; ``image`` then decodes it, and is not called beside."""
+    """For ``--encoder passthrough``; ``image`` then decodes it, and is not called otherwise."""
     missed: int = 0
     """Frames that came between the one before and this one, and were not taken in time."""
 
@@ -77,7 +77,7 @@ class Grabber(Protocol):
     def notes(self) -> Notes | None: ...
 
     def open(self) -> None:
-        """Open for the first time: raises UserError where there is nothing."""
+        """Open for the first time: raises UserError where there is no device or stream."""
 
     def restart(self) -> None:
         """Open again after `SignalLost`; raises that or `UserError` if it fails."""
@@ -87,7 +87,7 @@ class Grabber(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
 
 
 class LiveSource(Source):
@@ -95,7 +95,7 @@ class LiveSource(Source):
 
     Frames are not repeated when the camera is slower than the base rate. After a loss of signal, or any other error
     of the grabber, the source is opened again, with growing pauses, until it is closed. ``clock`` gives Unix
-    nanoseconds and must not go back, or the source is silent for as long.
+    nanoseconds and must not go back, or the source gives no frame until it has caught up.
     """
 
     live = True
@@ -130,16 +130,16 @@ class LiveSource(Source):
         self._pause = RetryPause(FIRST_WAIT_NS, _LONGEST_WAIT_NS)
         self._news = threading.Condition()
         self._pending: deque[tuple[int, Image]] = deque()
-        """(when taken, picture), the latest last: of a burst all, else one, or two for once."""
+        """(capture time, picture), the latest last: all of a burst, else one, or two for once."""
         self._missed_ns: int | None = None
-        """Capture time of the frame at whose coming another was missed."""
+        """Capture time of the frame before which another was missed."""
         self._gate = Gate(self.fps)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-source", daemon=True)
         self._thread.start()
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """Frames as they come, until the source is closed; ``capture_ns`` is when they were taken (`CameraClock`)."""
+        """Frames as they come, until the source is closed; ``capture_ns`` is their capture time (`CameraClock`)."""
         return (frame for frame in self.steps(start_ns=start_ns) if frame is not None)
 
     def steps(self, *, start_ns: int) -> Iterator[Frame | None]:  # noqa: ARG002 - a camera has its own time
@@ -158,7 +158,7 @@ class LiveSource(Source):
 
     @property
     def pending(self) -> int:
-        """Frames that have come and were not taken."""
+        """Frames that have come and were not taken yet."""
         return len(self._pending)
 
     def close(self) -> None:
@@ -186,7 +186,7 @@ class LiveSource(Source):
                     shot = self._grabber.grab()
                     capture_ns = camera_clock.capture_ns(shot.camera_ns, now_ns=self._clock())
                     self._take(shot, capture_ns, jitter_ns=camera_clock.jitter_ns)
-                except Exception as error:  # noqa: BLE001 - a driver or a decoder raises what it likes
+                except Exception as error:  # noqa: BLE001 - a driver or a decoder may raise any error
                     self._recover(error)
                     camera_clock.forget()
         finally:
@@ -215,7 +215,7 @@ class LiveSource(Source):
     def _recover(self, error: Exception) -> None:
         # Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop.
         again = False
-        while not self._stop.is_set():  # what stops because it is closed has not failed
+        while not self._stop.is_set():  # a grabber that stops because it is closed has not failed
             self._pause.failed(self._clock(), again=again)
             self._failures.failed(SOURCE_PART, f"{self._grabber.name} stopped ({_reason(error)})")
             if self._stop.wait(self._pause.pause_ns / SECOND_NS):
@@ -230,13 +230,13 @@ class LiveSource(Source):
 
 
 def _reason(error: Exception) -> str:
-    # A driver or a decoder raises what it likes.
+    # A driver or a decoder may raise any error.
     return str(error) if isinstance(error, SignalLost | UserError) else reason_of(error)
 
 
 @contextmanager
 def closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
-    """Close a live source as soon as ``stop`` is set: one whose signal is lost would keep its reader waiting."""
+    """Close a live source as soon as ``stop`` is set: a source without signal would keep its reader waiting."""
 
     def wait() -> None:
         stop.wait()
@@ -250,25 +250,25 @@ def closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
 
 
 _MOST_DELAY_NS = 5 * SECOND_NS
-"""A frame that seems older when it comes shows that the camera's clock is not set as ours is."""
+"""A frame that seems older than this shows that the camera's clock differs from ours."""
 _MEMORY_NS = 60 * SECOND_NS
-"""The least delay of the last one to two of these counts: two clocks drift apart."""
+"""The least delay of the last one to two of these periods counts: two clocks drift apart."""
 
 _STEP_NS = SECOND_NS
-"""From one frame to the next no delay changes by so much."""
+"""Largest change of the delay from one frame to the next without a clock that was set."""
 _MOST_BEHIND_NS = 2 * SECOND_NS
-"""Who is later than that, step by step, has another idea of a second: stamps of 25 a second on 24 frames."""
+"""Delay that has grown beyond this step by step means another length of a second: 25 stamps a second, 24 frames."""
 _RECENT = 32
-"""Frames whose delays tell how unevenly they come."""
+"""Number of newest frames whose delays give the jitter."""
 _MOST_JITTER_NS = SECOND_NS // 4
 
 
 class CameraClock:
     """Turns a camera's time stamps into this process's time.
 
-    A clock that is set as ours is (NTP) is taken at its word. Of any other only the differences count: the frame
+    A clock that agrees with ours (NTP) is used as it is. Of any other only the differences count: the frame
     that came quickest is taken to have come at once. Times never go back: where they would, as when the camera first
-    says what its clock reads, they go on at half the pace until they have met.
+    reports its clock, they go on at half the pace until they have met.
     """
 
     def __init__(self) -> None:
@@ -277,7 +277,7 @@ class CameraClock:
         self.forget()
 
     def forget(self) -> None:
-        """The camera was opened again: what it says from now on may count from another time."""
+        """The camera was opened again: its stamps may count from another time from now on."""
         self._least_ns: int | None = None
         self._former_ns: int | None = None
         self._delay_ns: int | None = None
@@ -287,11 +287,11 @@ class CameraClock:
 
     @property
     def jitter_ns(self) -> int:
-        """By how much some frames of late came later than others: they come in bursts. At most a quarter second."""
+        """By how much some recent frames came later than others: they come in bursts. At most a quarter second."""
         return min(_MOST_JITTER_NS, max(self._recent, default=0) - min(self._recent, default=0))
 
     def capture_ns(self, camera_ns: int | None, *, now_ns: int) -> int:
-        """The capture time of the frame that has just come; ``camera_ns`` is None where the camera does not say."""
+        """The capture time of the frame that has just come; ``camera_ns`` is None where the camera gives none."""
         taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(now_ns - camera_ns, now_ns)
         taken_ns = min(taken_ns, now_ns)
         if taken_ns <= self._last_ns:

@@ -31,7 +31,7 @@ _ACCEPTED = (
     "demo:codes,4k"
 )
 _PIPE = re.compile(r"-|(?:pipe|fd):.*|/dev/(?:stdin|fd/.*)|.*\s!\s.*", re.DOTALL)
-"""What is written for standard input, and for a pipeline of GStreamer."""
+"""Ways to write standard input, and a pipeline of GStreamer."""
 
 
 def open_source(  # noqa: PLR0911 - one return a kind of source
@@ -50,11 +50,11 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
 ) -> Source:
     """Open a source of base frames: a video file, an image folder, a stream's URL, a V4L2 device, or ``demo``.
 
-    ``size`` is (width, height) of the base frames in pixels, even, 64…8192, or how they follow from the source's;
+    ``size`` is (width, height) of the base frames in pixels, even, 64…8192, or a function of the source's size;
     ``fps`` is above 0 and at most 240; for ``fit`` see `View.fitted`. ``source_fps`` is the rate at which the
     images of a folder were taken (default: the base rate), or overrides a video file's own time stamps. ``clock``
-    is a live source's, Unix nanoseconds without steps, and ``failures`` is told when it is away; None for its own.
-    A file that is ``growing`` is read as it does. With ``coded`` each frame comes with the camera's own unit of it,
+    is a live source's, Unix nanoseconds without steps, and ``failures`` records its outages; None for its own.
+    A ``growing`` file is read while it grows. With ``coded`` each frame comes with the camera's own unit of it,
     at the camera's rate, whatever ``fps`` is.
     Raises `UserError` if nothing usable is there, or size or rate are impossible.
     """
@@ -91,8 +91,8 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
 
 
 def _check_address(spec: str, scheme: str) -> None:
-    # FFmpeg waits for ever at a port that there is not, and asks this machine where there is no host, as a script
-    # leaves it whose variable is empty. By UDP it also listens on ``?localport=``.
+    # FFmpeg waits for ever at a port that does not exist, and connects to this machine where there is no host, as
+    # from a script with an empty variable. By UDP it also listens on ``?localport=``.
     address = re.split(r"[/?]", spec.partition("://")[2])[0]
     if scheme.startswith(("rtsp", "rtmp", "http")) and address.rpartition("@")[2][:1] in {"", ":"}:
         raise UserError(f"source {shown(spec)!r} names no host: give one, as in {scheme}://camera/stream1")
@@ -126,7 +126,7 @@ def shown(spec: str) -> str:
 
 
 def _is_device(spec: str) -> bool:
-    # A file or a folder there is one, as in /dev/shm.
+    # An existing file or folder there is no device, as in /dev/shm.
     return spec.startswith("/dev/") and not (_is_played(spec) or _PIPE.fullmatch(spec))
 
 
@@ -137,7 +137,7 @@ def _is_played(spec: str) -> bool:
 def _is_there(spec: str, kind: Callable[[Path], bool] = Path.exists) -> bool:
     try:
         return bool(spec) and kind(Path(spec))
-    except (OSError, ValueError):  # too long for a name, or with a character that none has
+    except (OSError, ValueError):  # too long for a name, or with a character that no name has
         return False
 
 

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 _MOST_SIZES = 4
-"""So many sizes are told of: in a folder of photographs each picture may have one of its own."""
+"""Number of sizes that are logged: in a folder of photographs each picture may have one of its own."""
 
 
 def capture_time_ns(index: int, *, fps: Fraction, start_ns: int) -> int:
@@ -45,9 +45,9 @@ def hold(
     tail_s: Fraction,
     slack_s: Fraction = Fraction(0),
 ) -> Iterator[tuple[int, _T]]:
-    """Bring (seconds, frame) in order to the base rate: (index, frame) for index 0, 1, 2 … without a gap.
+    """Resample (seconds, frame) in order to the base rate: (index, frame) for index 0, 1, 2 … without a gap.
 
-    At each index that is the latest frame at or before index / fps; the first is the clip's zero, and the last is
+    Each index gets the latest frame at or before index / fps; the first is the clip's zero, and the last is
     shown for ``tail_s``. A frame that does not come after its predecessor replaces it. A time stamp ``slack_s`` too
     late still counts as on time: rounded to milliseconds, 2/30 s becomes 0.067 s.
     """
@@ -71,9 +71,9 @@ def hold(
 
 
 class Gate:
-    """Which frames of a live camera to take so that the base rate is kept on average, whatever the jitter.
+    """Selects frames of a live camera so that the base rate holds on average, whatever the jitter.
 
-    A camera slower than the base rate is taken whole; nothing is repeated.
+    All frames of a camera slower than the base rate are taken; none is repeated.
     """
 
     def __init__(self, fps: float) -> None:
@@ -83,7 +83,7 @@ class Gate:
         self._early_ns = self._period_ns // 4
 
     def accept(self, capture_ns: int) -> bool:
-        """Whether the frame taken at that time is wanted; call it once for each frame, in order."""
+        """Whether the frame of that capture time is wanted; call it once for each frame, in order."""
         if self._due_ns is not None and capture_ns < self._due_ns - self._early_ns:
             return False
         late = self._due_ns is None or capture_ns > self._due_ns + self._period_ns
@@ -98,7 +98,7 @@ class Resizer:
         view: the map from source to base pixels. Pictures follow it to within half a pixel of the base, because
             borders and cuts lie on whole pixels.
 
-    Pictures of another size, and those that are black or the same for long, are told of in the log, under ``name``.
+    Pictures of another size, and those that are black or the same for long, are logged under ``name``.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class Resizer:
 
 
 def into_canvas(picture: Image, size: tuple[int, int]) -> Image:
-    """The picture centred whole in a black canvas of that (width, height); itself where it fits exactly."""
+    """The whole picture centred in a black canvas of that (width, height); itself where it fits exactly."""
     high, wide = picture.shape[:2]
     if (wide, high) == size:
         return picture
@@ -189,12 +189,12 @@ def _scaled(picture: Image, size: tuple[int, int]) -> Image:
 
 _LONG_NS = 10 * SECOND_NS
 _BLACK = 24
-"""The highest level of a picture in which nobody sees anything."""
+"""The highest level of a picture that counts as black."""
 _EACH = 8
 
 
 class PictureCondition:
-    """Fed with each new picture; one that is only shown again is not fed again."""
+    """Notes each new picture; a picture that is only shown again is not passed again."""
 
     def __init__(self) -> None:
         self._before: Image | None = None

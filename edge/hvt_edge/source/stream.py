@@ -28,29 +28,29 @@ LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "ud
 
 _OPEN_S = 10.0
 _UNDECODED_S = 10.0
-"""Without a picture, while something comes; where nothing does, `patience_s` counts."""
+"""Longest time without a picture while packets come; without packets `patience_s` counts."""
 _MOST_TIMES = 64
 
 _NEVER = (
     *(av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError, av.error.HTTPBadRequestError),
     *(av.error.ProtocolNotFoundError, av.error.InvalidDataError, av.error.PermissionError, ValueError),
 )
-"""Whatever else refuses a stream may be a camera or a server that starts after us."""
+"""Errors that waiting cannot mend; with any other the camera or server may start after us."""
 _STAMPED = frozenset({"mpegts", "rtsp", "rtp", "sdp", "flv"})
-"""Formats whose time stamps are the sender's; of pictures in a row FFmpeg invents them."""
+"""Formats whose time stamps are the sender's; for pictures in a row FFmpeg invents them."""
 _IN_SEGMENTS = "hls"
-"""The format of which seconds come at once: each packet is held back until it is due by its own time."""
+"""The format in which seconds come at once: each packet is held back until it is due by its own time."""
 _PLAYLIST = ".m3u8"
 _MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
-"""Beyond it the others go by this one: after a wait for more, or a jump of the time stamps."""
+"""A packet later or earlier than this sets the time for the next ones: after a stall, or a jump of the stamps."""
 _OPTIONS = {
     **DEMUX_OPTIONS,
     "rtsp_transport": "tcp",  # over UDP a camera's keyframes lose packets on the first busy switch
     "fflags": "nobuffer",
     "flags": "low_delay",
     "analyzeduration": "2000000",
-    "buffer_size": "4194304",  # of a UDP socket, where the system allows so much (net.core.rmem_max)
-    "reorder_queue_size": "500",  # FFmpeg's own, which `nobuffer` takes away; a datagram that is late is waited for
+    "buffer_size": "4194304",  # of a UDP socket, where the system allows that much (net.core.rmem_max)
+    "reorder_queue_size": "500",  # FFmpeg's own, which `nobuffer` removes; late datagrams are waited for
 }
 
 
@@ -74,13 +74,13 @@ class StreamGrabber:
         self._shots: Iterator[Shot] = iter(())
 
     def open(self) -> None:
-        """Open, where it is not open yet. Raises `UserError` if there is no video within ``open_s``."""
+        """Open, if it is not open yet. Raises `UserError` if there is no video within ``open_s``."""
         if self._container is None:
             self._start()
 
     @property
     def holds_a_clip(self) -> bool:
-        """Whether what is open has a known duration: a file behind an address, not a live stream."""
+        """Whether the open stream has a known duration: a file behind an address, not a live stream."""
         return bool(self._container.duration)
 
     def restart(self) -> None:
@@ -109,7 +109,7 @@ class StreamGrabber:
         container = _open(self._url, open_s=self._open_s, read_s=self._read_s)
         stream = self._choose(container)
         if stream is None:
-            may_come = not container.duration  # a camera that boots describes itself before its encoder runs
+            may_come = not container.duration  # a booting camera describes itself before its encoder runs
             container.close()
             kind = NotYetError if may_come else UserError
             raise kind(f"source {self.name} holds no video stream")
@@ -128,7 +128,7 @@ class StreamGrabber:
 
 
 def is_stamped(container: Any) -> bool:
-    """Whether its time stamps are the sender's."""
+    """Whether the container's time stamps are the sender's."""
     return not _STAMPED.isdisjoint(container.format.name.split(","))
 
 
@@ -159,8 +159,8 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
 
 
 class _PyAvClock:
-    # PyAV passes over what comes under a number that is not there at the start, as of another program, and begins to
-    # count its timeout anew at each. From the time that `packets_of` says on, its clock runs away, and it gives up.
+    # PyAV skips packets of a stream number that was not there at the start, as of another program, and restarts its
+    # timeout at each. From the time that `packets_of` sets on, this clock leaps ahead, so that PyAV gives up.
 
     here = threading.local()
     _leaps = itertools.count(1)
@@ -176,8 +176,8 @@ av.container.core.time = _PyAvClock  # type: ignore[attr-defined]
 
 
 def packets_of(container: Any, stream: Any) -> Iterator[Any]:
-    """The packets of the film as they come. Raises `SignalLost` where for ten seconds all else alone came."""
-    packets = container.demux()  # of the film alone it would not return while others come
+    """The packets of the film as they come. Raises `SignalLost` after ten seconds of other packets alone."""
+    packets = container.demux()  # for the film alone it would not return while others come
     until_s = time.monotonic() + _UNDECODED_S
     in_segments, zero_s = container.format.name == _IN_SEGMENTS, None
     while True:
@@ -203,7 +203,7 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
 
 
 def _held_back(at_s: float, zero_s: float | None) -> float:
-    # Wait until a packet of that time is due, where time 0 was at ``zero_s`` of the clock; returns the latter.
+    # Wait until a packet of that time is due; ``zero_s`` is the clock's time of stamp 0, which it returns.
     now_s = time.monotonic()
     if zero_s is None or not -_MOST_LATE_S < zero_s + at_s - now_s < _MOST_EARLY_S:
         return now_s - at_s
@@ -212,10 +212,10 @@ def _held_back(at_s: float, zero_s: float | None) -> float:
 
 
 def camera_time_ns(packet: av.Packet[Any], *, stamped: bool) -> int | None:
-    """Its capture time by a clock of the camera's, in nanoseconds; None where unknown.
+    """The packet's capture time by the camera's clock, in nanoseconds; None where unknown.
 
-    Where RTCP sender reports tell the camera's time (RFC 3550, 6.4.1) it is Unix time; of the stream's own time
-    stamps, where it is ``stamped``, only the differences count.
+    With RTCP sender reports, which carry the camera's time (RFC 3550, 6.4.1), it is Unix time; of the stream's own
+    stamps, if it is ``stamped``, only the differences count.
     """
     if packet.has_sidedata("prft"):
         return 1000 * int.from_bytes(bytes(packet.get_sidedata("prft"))[:8], "little")
@@ -244,7 +244,7 @@ def _open(url: str, *, open_s: float, read_s: float) -> Any:
                 "PyAV is built without it: ffmpeg -i ADDRESS -c copy -f mpegts udp://127.0.0.1:PORT brings it"
             )
         if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("rtsp"):
-            # FFmpeg's word for no answer, or half of one, too: a camera that boots opens its port first.
+            # FFmpeg reports no answer, or half of one, like this too: a camera that boots opens its port first.
             kind, cause = NotYetError, "no answer of RTSP in time"
         if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("http"):
             # A camera's JPEGs without the boundary before the first: FFmpeg finds them by their own beginnings.
@@ -254,7 +254,7 @@ def _open(url: str, *, open_s: float, read_s: float) -> Any:
 
 
 def _pictures_of(container: Any, name: str) -> Any:
-    # The same, if it holds pictures; raises `OSError` where anything else was taken for some.
+    # The container, if it holds pictures; raises `OSError` where other data was taken for pictures.
     if container.size == 0:
         container.close()
         raise NotYetError(f"source {name} is empty so far")
@@ -266,7 +266,7 @@ def _pictures_of(container: Any, name: str) -> Any:
 
 
 def _spelt(url: str) -> str:
-    # How to spell it where a password is likely to have been taken for something else; empty where it is not.
+    # How to write a password that was probably misread as part of the address; empty where there is none.
     body = url.partition("://")[2]
     odd = set("/?#[]") & set(body.rpartition("@")[0])
     if not odd:

@@ -66,11 +66,11 @@ class VideoSource(ClipSource):
 
     @property
     def source_fps(self) -> float:
-        """The clip's own frame rate, as it says or as it was overridden."""
+        """The clip's own frame rate, as stored or as overridden."""
         return float(1 / self._stamps.period_s)
 
     def shown_frames(self) -> tuple[int, tuple[int, ...]]:
-        """Number of frames of the clip, and the one that each base frame shows: as it is played."""
+        """Number of frames of the clip, and the one that each base frame shows when it is played."""
         container, stream = open_video(self._spec)
         with container:
             times = [at_s for at_s, _ in decoded(container, stream, name=self._name, stamps=self._stamps)]
@@ -92,7 +92,7 @@ class VideoSource(ClipSource):
                 if index == self._limit:
                     return
                 capture_ns = capture_time_ns(index, fps=base_rate, start_ns=start_ns)
-                if held is None or held[0] is not frame:  # only what is shown is converted
+                if held is None or held[0] is not frame:  # only shown frames are converted
                     picture = self._pictures.bgr(frame)
                     held = (frame, self._resizer.frame(picture, index=index, capture_ns=capture_ns))
                 yield replace(held[1], index=index, capture_ns=capture_ns)

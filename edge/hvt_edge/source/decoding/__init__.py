@@ -1,5 +1,5 @@
-"""Coded video to pictures as a player shows them; the rest of `source` says whose and when.
+"""Decodes coded video to pictures as a player shows them; the rest of `source` chooses the video and its pace.
 
-`container` opens files and streams, `timeline` mends time stamps, `pictures` makes upright BGR of square pixels of
-what is decoded, and eight bits of sixteen.
+`container` opens files and streams, `timeline` mends time stamps, `pictures` turns decoded frames into upright BGR of
+square pixels, and sixteen bits into eight.
 """

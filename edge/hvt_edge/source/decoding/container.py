@@ -25,30 +25,30 @@ from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps,
 _log = logging.getLogger(__name__)
 
 _TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
-"""FFmpeg plays text files as a terminal's screen; nobody means that."""
+"""FFmpeg plays text files as a terminal's screen; no user means that."""
 _PICTURE_CODECS = frozenset({"mjpeg", "png", "bmp", "gif", "tiff", "webp", "jpegxl"})
 _NO_FILM = Disposition.attached_pic | Disposition.still_image | Disposition.timed_thumbnails
 _OPEN_S, _READ_S = 10.0, 10.0
 _THREAD_PX, _THREAD_FPS = 1280 * 720, 30
-"""What one thread decodes beside all else that it does: 9 ms a picture of H.264 at 8 Mbit/s."""
+"""The load that one thread decodes beside its other work: 9 ms a picture of H.264 at 8 Mbit/s."""
 _NO_STAMPS = 0x80
 """``AVFMT_NOTIMESTAMPS`` of libavformat: a raw stream, whose times FFmpeg invents at 25 frames a second."""
 _PICTURES_IN_A_ROW = "_pipe"
-"""How the names of such formats end (``jpeg_pipe``), whose times FFmpeg invents too."""
+"""The ending of the names of picture formats (``jpeg_pipe``), whose times FFmpeg invents too."""
 _MAY_JUMP = 0x200
-"""``AVFMT_TS_DISCONT``: a container whose stamps may jump by what it is."""
+"""``AVFMT_TS_DISCONT``: a container whose stamps may jump by design."""
 _MOST_FPS = 240
-"""A stream that says more has its clock there, or was told no rate: 500, 90000."""
+"""A stream with a higher rate reports its clock there, or was given no rate: 500, 90000."""
 _SURVEYED = 256
-"""Packets at the start of a clip whose stamps are looked at."""
+"""Packets at the start of a clip whose stamps are surveyed."""
 QUIET_S, _POLL_S = 10.0, 0.1
-"""A file that has not grown for so long has ended."""
+"""A file that has not grown for this long has ended."""
 _MOST_BOXES = 2**16
 """Nine hours of fragments, a second each."""
 DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
 """A sender of MPEG-TS that begins anew may number its film otherwise: it is the same film to a viewer."""
 _FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0", "m3u8_hold_counters": "3"}
-"""A playlist of HLS whose recorder ended before it is read from its beginning, and looked at thrice for more."""
+"""An HLS playlist whose recorder has ended is read from its beginning, and polled thrice for more."""
 _PLAYLIST = ".m3u8"
 _WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
@@ -64,7 +64,7 @@ def is_local(spec: str) -> bool:
 
 
 def name_of(spec: str) -> str:
-    """The name as it may be printed; `is_local` ones are known to be there."""
+    """The name as it may be printed; `is_local` paths are printed whole."""
     return spec if is_local(spec) else redacted(spec)
 
 
@@ -74,10 +74,10 @@ class _GrowingFile:
     def __init__(self, path: str) -> None:
         self._file = os.open(path, os.O_RDONLY)
         self._ended = False
-        weakref.finalize(self, os.close, self._file)  # PyAV lets go of it, and does not close it
+        weakref.finalize(self, os.close, self._file)  # PyAV drops it without closing it
 
     def read(self, size: int) -> bytes:
-        """At most ``size`` bytes; nothing, also to later calls, once it has not grown for ten seconds."""
+        """At most ``size`` bytes; none, also in later calls, once it has not grown for ten seconds."""
         until_s = time.monotonic() + QUIET_S
         while not (data := os.read(self._file, size)) and not self._ended:
             if time.monotonic() >= until_s:
@@ -90,10 +90,10 @@ class _GrowingFile:
 def open_video(
     spec: str, *, growing: bool = False, note: Callable[[str], None] = lambda _: None
 ) -> tuple[Any, Any]:
-    """Open a file or a URL, and the stream that is its film. ``note`` is told which, where there are several.
+    """Open a file or a URL, and the stream that is its film. ``note`` receives the choice, where there are several.
 
-    With ``growing`` a file that grows is read as it does. Raises `UserError` where there is none, `NotYetError` where
-    what grows is too short so far.
+    With ``growing`` a file is read while it grows. Raises `UserError` where there is no film, `NotYetError` where
+    a growing file is too short so far.
     """
     name, local = name_of(spec), is_local(spec)
     refusal = NotYetError if local and growing else UserError
@@ -105,7 +105,7 @@ def open_video(
         file, options = where, _FILE_OPTIONS
         if (
             local and growing and spec.endswith(_PLAYLIST)
-        ):  # FFmpeg looks for more itself, for as long as it may
+        ):  # FFmpeg polls for more itself, for as long as the option allows
             options = {**options, "m3u8_hold_counters": "1000"}
         elif local and growing:
             file = _GrowingFile(spec)
@@ -124,7 +124,7 @@ def open_video(
         raise refusal(f"source {name!r} holds no video; accepted is any video file that FFmpeg decodes")
     stream.thread_type = "AUTO"
     codec = stream.codec_context
-    # Each thread decodes a picture of its own, and holds it and what it builds on.
+    # Each thread decodes a picture of its own, and holds it and its reference pictures.
     quick = max(1.0, float(said_rate(stream) or 0) / _THREAD_FPS)
     threads = math.ceil(codec.width * codec.height * quick / _THREAD_PX)
     codec.thread_count = max(1, min(threads, os.cpu_count() or 1))
@@ -134,7 +134,7 @@ def open_video(
 def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: None) -> Any | None:
     """The film: no cover picture, the one marked as default, then the largest. None where there is no video.
 
-    ``note`` is told which it is where there is a choice.
+    ``note`` receives the choice, where there are several.
     """
     able = [one for one in container.streams.video if one.codec_context is not None]
     able = [one for one in able if one.codec_context.name not in _TEXT_CODECS]
@@ -167,7 +167,7 @@ def without_stamps(stream: Any) -> bool:
 
 
 def said_rate(stream: Any) -> Fraction | None:
-    """Frames a second as the container says, or the stream itself where the container invents them; else None."""
+    """Frames a second by the container, or by the stream itself where the container invents them; else None."""
     if without_stamps(stream):
         rate = stream.codec_context.framerate
     else:
@@ -176,9 +176,9 @@ def said_rate(stream: Any) -> Fraction | None:
 
 
 def duration_s(stream: Any) -> Fraction | None:
-    """How long it lasts, as the container says; None where it does not.
+    """The film's duration by the container; None where it has none.
 
-    Matroska says when it ends: a recording that goes on from an earlier one does not begin at 0.
+    Matroska stores the end instead: a recording that continues an earlier one does not begin at 0.
     """
     if stream.duration:
         return _seconds(stream.duration, stream.time_base)
@@ -208,7 +208,7 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
     reorders = bool(stream.codec_context.has_b_frames)
     stamps = surveyed(times, said_fps=rate, reorders=reorders)
     long_s = LONG_STEP_S if container.format.flags & _MAY_JUMP else LONG_PAUSE_S
-    # Those of the presentation in AVI are FFmpeg's guess, wrong by where frames were dropped, or two lie in a packet.
+    # AVI's presentation stamps are FFmpeg's guess, wrong where frames were dropped, or two lie in a packet.
     return replace(stamps, ordered=stamps.ordered and container.format.name != "avi", long_s=long_s), first
 
 
@@ -250,7 +250,7 @@ class _Reading:
         self._damaged = self._shown_damaged = self._count = self._lossy = 0
         self._ended = ""
         self.end_s: Fraction | None = None
-        """By its time stamps, as far as these go on."""
+        """End of the film by its time stamps, as far as these go on."""
         self._end_byte = 0
 
     def frames(self) -> Iterator[av.VideoFrame]:
@@ -258,10 +258,10 @@ class _Reading:
             if isinstance(packet, Exception):
                 self._ended = f"it breaks off ({cause_of(packet)})"
             else:
-                self._count += bool(packet.size)  # what an edit list hides is there too
+                self._count += bool(packet.size)  # frames that an edit list hides are there too
                 self._lossy += packet.is_corrupt and self._container.format.name == "mpegts"
                 self._end_byte = max(self._end_byte, (packet.pos or 0) + packet.size)
-                # By its own time: of decoding, the last of B-frames lies whole frames before it.
+                # By presentation time: in decoding order, the last B-frame lies whole frames before the end.
                 stamp = packet.dts if packet.pts is None else packet.pts
                 if stamp is not None:
                     end_s = Fraction(stamp + (packet.duration or 0)) * (packet.time_base or 0)
@@ -287,7 +287,7 @@ class _Reading:
             yield f"is unfinished: {why}"
 
     def _unfinished(self) -> str:
-        # Why the played part is not all that there should be; empty if nothing says so.
+        # The reason why the played part is not the whole film; empty if nothing shows one.
         container, stream = self._container, self._stream
         if (size := _size_of(container)) != self._size:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
@@ -299,7 +299,7 @@ class _Reading:
         if (why := self._lacks_pictures()) or container.format.name == "mpegts":
             return why
         begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
-        # That of the container may be that of the sound.
+        # The container's duration may be that of the sound.
         said_s = duration_s(stream) if stream.duration or len(container.streams) == 1 else None
         if said_s is not None and self.end_s is not None:
             missing_s = said_s - (self.end_s - begin_s)
@@ -310,11 +310,11 @@ class _Reading:
     def _frames_there(self) -> int:
         if self._container.format.name != "avi":
             return self._count
-        # With those that its recorder dropped, as the places of the others say.
+        # With the frames that its recorder dropped, by the places of the others.
         return max(self._count, math.ceil((self.end_s or 0) * (self._stream.average_rate or 0)))
 
     def _lacks_pictures(self) -> str:
-        # The same of formats without an index, and of two MP4 put together, by their bytes.
+        # The same for formats without an index, and for two joined MP4 files, by their bytes.
         name, size = self._container.format.name, self._size or 0
         joined = (
             "mp4" in name and _boxes_of(Path(self._container.name.removeprefix("file:"))).count(b"moov") > 1
@@ -342,13 +342,13 @@ class _Reading:
 
 
 def packets_of(container: Any, stream: Any) -> Iterator[Any]:
-    """All of a stream; where it breaks off, the error is the last."""
+    """All packets of a stream; where it breaks off, the error comes last."""
     packets = container.demux(stream)
     while True:
         try:
             packet = next(packets)
         except (StopIteration, IndexError):
-            return  # the second where another stream began: PyAV has none of its number
+            return  # the second where another stream began: PyAV has no stream of its number
         except av.error.FFmpegError as error:
             yield error
             return

@@ -18,29 +18,29 @@ from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, Interpola
 from hvt_common.values import Image
 from hvt_edge.source.contract import Notes
 
-# PyAV refuses all side data of a frame where FFmpeg has put a kind by it that PyAV has no name for, such as the EXIF
-# data of a JPEG. Such a kind goes by the name of one that nobody reads here.
+# PyAV refuses all side data of a frame where FFmpeg has added a kind that PyAV has no name for, such as the EXIF
+# data of a JPEG. Such a kind gets the name of one that is not read here.
 Type._missing_ = classmethod(lambda cls, value: cls.VIDEO_HINT)  # type: ignore[assignment] # noqa: ARG005
 
 _UNTAGGED_SD_PX = 576
-"""A picture that says no colour matrix is BT.601 with at most so many lines, else BT.709: as players take it."""
+"""A picture without a colour matrix is BT.601 up to this number of lines, else BT.709, as in players."""
 _DEEP_BITS = 10
-"""Grey of more is a sensor's levels, not brightness."""
+"""Grey of more bits is a sensor's levels, not brightness."""
 _COLOURS = 3
 """Components of a pixel in colour: a palette has one, grey with transparency two."""
 _HDR = {16: "PQ", 18: "HLG"}
 """Transfers of ITU-T H.273, table 3."""
 _BT709, _BT601 = 1, 6
 _UNSAID = (0, 2, 3)
-"""Matrices of H.273, table 4: 0 is RGB, which no YUV is, 2 says nothing, 3 is reserved."""
+"""Matrices of H.273, table 4, that give none: 0 is RGB, which no YUV is, 2 is unspecified, 3 is reserved."""
 _CONVERTED = (1, 4, 5, 6, 7, 9)
-"""Those that swscale converts: not YCgCo, ICtCp and what broken encoders invent."""
+"""Matrices that swscale converts: not YCgCo, ICtCp and inventions of broken encoders."""
 _MOST_ASPECT = 8
 _Turn = tuple[bool, bool, bool]
 """Whether rows become columns, and whether it is then mirrored left to right, and upside down."""
 _UPRIGHT = (False, False, False)
 _WITH_SEI = frozenset({"h264", "hevc"})
-"""Codecs that say a turn by a message at a keyframe, which holds for the pictures that follow (H.274, 8.9)."""
+"""Codecs that signal a turn by a message at a keyframe, which holds for the following pictures (H.274, 8.9)."""
 _TURNS = {
     _UPRIGHT: "",
     (False, True, False): "mirrored left to right",
@@ -59,22 +59,22 @@ class Pictures:
     def __init__(self, notes: Notes) -> None:
         self._say = notes
         self._reformatter = VideoReformatter()
-        """Kept: the table of an HDR picture takes seconds to make."""
+        """Reused: the table of an HDR picture takes seconds to make."""
         self._stretch = Stretch(notes)
         self._aspect = Fraction(1)
-        """Width of a pixel over its height, as the container says, or the film at its beginning."""
+        """Width of a pixel over its height, by the container, or by the film at its beginning."""
         self._aspects: dict[tuple[int, int], Fraction] = {}
-        """The newest of pictures of a (width, height)."""
+        """The newest aspect of pictures by (width, height)."""
         self._coded_aspect: Fraction | None = None
         self._held_turn: _Turn | None = None
-        """The newest that the film itself said."""
+        """The newest turn signalled by the film itself."""
         self._graph: Graph | None = None
         self._shape: tuple[int, int, str] | None = None
         """(width, height, format) for which the graph was made."""
         self._stream: Any = None
 
     def begin(self, stream: Any) -> None:
-        """Read ``stream`` from here on; the container's word on its pixels goes before the codec's."""
+        """Read ``stream`` from here on; the container's pixel aspect goes before the codec's."""
         self._stream, self._graph, self._held_turn = stream, None, None
         self._aspects, self._coded_aspect = {}, None
         self._aspect = self._checked_aspect(stream.sample_aspect_ratio)
@@ -91,7 +91,7 @@ class Pictures:
         return aspect
 
     def _note(self, frame: av.VideoFrame) -> None:
-        # A film may say in its midst how it is to be shown, and says it of what follows.
+        # A film may change in its midst how it is to be shown, and the change holds for the following frames.
         codec = self._stream.codec_context
         coded = codec.sample_aspect_ratio or Fraction(1)
         self._coded_aspect = self._coded_aspect or coded
@@ -121,7 +121,7 @@ class Pictures:
             yield from self._pulled()
 
     def bgr(self, frame: av.VideoFrame) -> Image:
-        """(height, width, 3) uint8, with square pixels, turned and mirrored as the display matrix says."""
+        """(height, width, 3) uint8, with square pixels, turned and mirrored by the display matrix."""
         picture = self._upright_colours(frame)
         turn = _turn_of(frame) or self._held_turn or _UPRIGHT
         if said := _TURNS[turn]:
@@ -201,14 +201,14 @@ def matrix_of(frame: av.VideoFrame) -> int:
 
 
 def turn_of(frame: av.VideoFrame) -> str:
-    """The turn of a frame by its display matrix, to the nearest right angle, in words; empty for as it is."""
+    """The turn of a frame by its display matrix, to the nearest right angle, in words; empty for none."""
     return _TURNS[_turn_of(frame) or _UPRIGHT]
 
 
 def _turn_of(frame: av.VideoFrame) -> _Turn | None:
     # The turn by the display matrix (ISO/IEC 14496-12, 8.3.2); None without one.
-    # Not `frame.side_data`: that holds the frame which holds it, and each picture would stay until Python looks for
-    # such circles, a hundred megabytes later.
+    # Not `frame.side_data`: its object and the frame refer to each other, and each picture would stay until Python's
+    # cycle collector runs, a hundred megabytes later.
     container: Any = SideDataContainer
     said = container(frame).get("DISPLAYMATRIX")
     if said is None:
@@ -228,14 +228,14 @@ def _turned(picture: Image, turn: _Turn) -> Image:
 
 _LOW_PCT, _HIGH_PCT = 0.5, 99.5
 _LEAST_SPAN = 64
-"""Sensor levels: a wall of one temperature is not to become noise from black to white."""
+"""Sensor levels: a wall of one temperature must not become noise from black to white."""
 _LEAST_DEGREES = 1.0
-"""The same of floating-point pictures, which are in degrees, or from 0 to 1."""
+"""The same for floating-point pictures, which are in degrees, or from 0 to 1."""
 _SETTLING_S = 3.0
-"""A warm body that comes in must not darken all else at once."""
+"""A warm body that comes in must not darken the rest of the picture at once."""
 _LONGEST_S = 1.0
 _EACH = 4
-"""Each fourth pixel of each fourth row says enough."""
+"""Each fourth pixel of each fourth row is sample enough."""
 
 
 class Stretch:
@@ -243,7 +243,7 @@ class Stretch:
 
     These follow the scene with a time constant of three seconds.
 
-    ``note`` is told the first levels.
+    ``note`` receives the first levels.
     """
 
     def __init__(self, note: Callable[[str], None]) -> None:
@@ -254,8 +254,8 @@ class Stretch:
     def bgr(self, levels: npt.NDArray[Any], *, at_s: float, bits: int = 0) -> Image:
         """(height, width) numbers as (height, width, 3) uint8; ``at_s`` is the picture's time in seconds.
 
-        What is not finite, as where a sensor saw nothing, is black. ``bits`` are those of the source, where the array
-        has more.
+        Values that are not finite, where a sensor saw nothing, become black. ``bits`` is the source's depth, where
+        the array has more.
         """
         first, bits = self._range is None, bits or 8 * levels.itemsize
         least: float = _LEAST_SPAN

@@ -13,13 +13,13 @@ from typing import Any
 LONG_STEP_S = Fraction(10)
 """A step of more than this, and than three usual ones, is a jump where a container may have some (MPEG-TS)."""
 LONG_PAUSE_S = Fraction(3600)
-"""The same in any other, where a recorder that waits for motion leaves pauses (``max_frame_duration`` of ffplay)."""
+"""The same in other containers, where a recorder that waits for motion leaves pauses (ffplay, max_frame_duration)."""
 _LONG_STEPS = 3
 _FEW = 8
-"""After so many stamps that do not rise, the stream has none."""
+"""After this many stamps that do not rise, the stream has none."""
 _SAME = Fraction(2, 100)
 _ROUNDED_S = Fraction(1, 1000)
-"""Matroska, FLV and ASF round times to milliseconds, and what is made of them keeps these in finer units."""
+"""Matroska, FLV and ASF round times to milliseconds, and files made from them keep these in finer units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,25 +31,25 @@ class Stamps:
     usable: bool
     """Whether they rise at all; else frames follow each other by ``period_s``."""
     ordered: bool = True
-    """Whether they are of the presentation; else of the decoding, as in AVI: the n-th frame shown has the n-th."""
+    """Whether they are presentation times; else decoding times, as in AVI: the n-th frame shown has the n-th."""
     long_s: Fraction = LONG_STEP_S
-    """A step of more is a jump."""
+    """A longer step is a jump."""
 
     def timeline(self, stream: Any) -> Timeline:
         quantum_s = stream.time_base if self.usable else None
         return Timeline(self.period_s, quantum_s=quantum_s, long_s=self.long_s)
 
     def slack_s(self, stream: Any) -> Fraction:
-        """By how much rounding may have made a stamp late."""
+        """The time by which rounding may have made a stamp late."""
         return max(_ROUNDED_S, Fraction(stream.time_base or 0)) if self.usable else Fraction(0)
 
 
 def surveyed(
     packets: Sequence[tuple[Fraction | None, Fraction | None]], *, said_fps: Fraction | None, reorders: bool
 ) -> Stamps:
-    """From (presentation, decoding) seconds of packets; ``reorders`` says whether the decoder has B-frames to sort.
+    """From (presentation, decoding) seconds of packets; ``reorders``: the decoder has B-frames to sort.
 
-    ``said_fps`` is the container's rate. It counts where the stamps bear it out within 2 %, and where there are none.
+    ``said_fps`` is the container's rate. It counts if the stamps agree with it within 2 %, and if there are none.
     """
     said_s = 1 / (said_fps or Fraction(25))
     shown = [one for one, _ in packets if one is not None]
@@ -62,7 +62,7 @@ def surveyed(
     usual_s = Fraction(median(rising))
     most_s = max(LONG_STEP_S, _LONG_STEPS * usual_s)
     near = [step for step in steps if 0 <= step <= most_s]
-    # Of stamps in whole seconds the mean tells the rate, of uneven ones the median.
+    # Of stamps in whole seconds the mean gives the rate, of uneven ones the median.
     usual_s = min(usual_s, sum(near, Fraction(0)) / len(near)) if near else said_s
     if abs(usual_s / said_s - 1) < _SAME:
         usual_s = said_s
@@ -73,7 +73,7 @@ def surveyed(
 class Timeline:
     """One reading of a stream, whose stamps are whole ``quantum_s``.
 
-    What steps back, or by more than ``long_s`` and three usual steps, follows its predecessor as usual.
+    A stamp that steps back, or by more than ``long_s`` and three usual steps, follows its predecessor as usual.
 
     Such a step is a clock that was set or ran over, a damaged stamp, or two recordings put together. Two frames of
     one time are both shown: the second comes a little later.
@@ -82,7 +82,7 @@ class Timeline:
     def __init__(
         self, period_s: Fraction, *, quantum_s: Fraction | None = None, long_s: Fraction = LONG_STEP_S
     ) -> None:
-        # A mended step is one that the stamps can say, whole ones, as those around it; a frame that came a little
+        # A mended step is a whole number of quanta, like the steps around it; a frame that came a little
         # late would be passed over at the next instant of the base.
         self._period_s = period_s if not quantum_s else max(1, math.floor(period_s / quantum_s)) * quantum_s
         self._most_s = max(long_s, _LONG_STEPS * period_s)
@@ -90,7 +90,7 @@ class Timeline:
         self._at_s: Fraction | None = None
         self._offset_s = Fraction(0)
         self._former_s: Fraction | None = None
-        """That of before the last jump."""
+        """The offset before the last jump."""
         self.jumps: list[tuple[Fraction, Fraction]] = []
         """Place of each repair in the presentation, and the size of the step; seconds."""
 
@@ -120,7 +120,7 @@ class Timeline:
         if stamp_s is None:
             return self._at_s + self._period_s
         expected_s = self._at_s + self._period_s
-        if self._stamp_s is None:  # the first that is stamped
+        if self._stamp_s is None:  # the first frame with a stamp
             self._offset_s = expected_s - stamp_s
             return expected_s
         step_s, near_s = stamp_s - self._stamp_s, _LONG_STEPS * self._period_s
