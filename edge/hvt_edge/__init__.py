@@ -1,4 +1,4 @@
-"""The edge side, camera to link: `app.Edge` is all of it, `wiring` builds its parts.
+"""The edge side, camera to link: `app.Edge` runs it, `wiring` builds its parts.
 
 A program that has frames of its own uses `open`, see docs/library.md.
 """
@@ -14,7 +14,7 @@ __all__ = ["open"]
 
 
 def __getattr__(name: str) -> Any:
-    """Only who uses it loads it."""
+    """Load `open` only when it is used."""
     if name == "open":
         from hvt_edge.library import open_edge  # noqa: PLC0415
 

@@ -49,14 +49,14 @@ from hvt_edge.world import World
 
 _GOODBYE_S = 1.5
 _STUCK_S = 5.0
-"""A loop that has not turned for so long, and two frames longer, hangs."""
+"""A loop that has not turned for this long, and two frames longer, hangs."""
 
 
 class Edge:
     """One run of one edge: build it, `run` it once.
 
-    ``on_started()`` is called once nothing is refused any more; ``world`` is where frames come from and messages
-    go.
+    ``on_started()`` is called once all checks have passed; ``world`` supplies frames and carries messages
+    away.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Edge:
         self._heartbeat: Heartbeat | None = None
         """None before the parts are built."""
         self._reached = False
-        """Whether anybody has subscribed to the video."""
+        """Whether any program has subscribed to the video."""
         self.ledger = Ledger(window_ns=config.window_ns)
 
     def run(self) -> dict[str, Any]:
@@ -194,7 +194,7 @@ class Edge:
             )
 
     def _step_pose(self, stages: Stages, frame: Frame | None) -> None:
-        # A slow machine plays a clip longer, and what it shows comes later.
+        # A slow machine plays a clip longer, and its poses come later.
         if stages.pose is None or frame is None:
             return
         stages.pose.step(
@@ -241,7 +241,7 @@ class Edge:
         return source
 
     def _open_detector(self, config: EdgeConfig, source: Source) -> FailingDetector:
-        # In real time one that fails is opened anew.
+        # In real time a detector that fails is opened anew.
         world = self._world
         opened = partial(
             open_for_flight,
@@ -249,12 +249,12 @@ class Edge:
             lambda: world.open_detector(config),
             lambda detector: world.warm_up(config, detector, source),
         )
-        if self._lockstep:  # one that was opened anew would make its result one of something else
+        if self._lockstep:  # a detector opened anew would give another result
             return opened()
         first = with_lower_priority(opened, stop=self._stop)
         if first is None:  # stopped before it is open
             return unopened(config, lambda: world.open_detector(config))
-        # Not kept beside the one that is opened in its place once it has failed: it holds 100 MB.
+        # Not kept beside the detector opened in its place once it has failed: each holds 100 MB.
         ready = [first]
         return RetriedDetector(
             lambda: ready.pop() if ready else world.open_detector(config),
@@ -277,10 +277,10 @@ class Edge:
     def _say_goodbye(self, stages: Stages, link: EdgeLink) -> None:
         transmitter = stages.link.transmitter
         if stages.backlog is not None:
-            stages.backlog.worker.send_no_more()  # the last report says how much there was
+            stages.backlog.worker.send_no_more()  # the last report gives the totals
         stages.status.send("ended")
         self._reached |= link.has_subscriber(Channel.BASE)
-        if link.has_ground():  # what is still in a queue would be lost with the session
+        if link.has_ground():  # messages still in a queue would be lost with the session
             until_ns = self._world.clock() + round(_GOODBYE_S * SECOND_NS)
             self._world.inbox.wait_for_end(
                 base=self.ledger.messages(Account.BASE),

@@ -33,7 +33,7 @@ _DESCRIPTION = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the edge; return 0, 1 if nobody received a picture of it, or 2 after a sentence on the fault."""
+    """Run the edge; return 0, 1 if no program received a picture of it, or 2 after a sentence on the fault."""
     return exit_with_sentence(_run, program="hvt-edge", argv=argv)
 
 

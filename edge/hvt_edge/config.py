@@ -58,13 +58,13 @@ _MIN_BUDGET_BPS = 100_000
 _STORE_BYTES = 200_000_000
 _LEAST_STORE_BYTES = 10_000_000
 LEAST_FPS = 2.0
-"""To this ``--fps auto`` may fall: two frames in a window of a second."""
+"""The lowest rate of ``--fps auto``: two frames in a window of a second."""
 _AUTO_FIRST_SHARE = 0.95
-"""With ``--profile auto`` stills begin with the least."""
+"""The first share of ``--profile auto``: stills begin with the least."""
 POSE_BPS = 1_200
 """The share of ``--pose`` in the budget: a message a second."""
 TRACKS_BPS = 8_000
-"""The share of ``--send-tracks`` in the budget: about that for 45 boxes three times a second."""
+"""The share of ``--send-tracks`` in the budget: about 45 boxes three times a second."""
 
 _SOURCE, _LINK, _SENT = Group("source"), Group("budget and link"), Group("what to send")
 _MODELS, _FILES = Group("models"), Group("files")
@@ -319,7 +319,7 @@ class EdgeConfig:
 
     @property
     def min_budget_bps(self) -> int:
-        """The same, where the budget is not lower itself."""
+        """The floor of ``--adapt``, unless the budget itself is lower."""
         return self.min_budget or _MIN_BUDGET_BPS
 
     @property
@@ -333,7 +333,7 @@ class EdgeConfig:
 
     @property
     def share(self) -> float:
-        """Share of the budget for the base stream; where it is to follow the scene, the one to begin with."""
+        """The base stream's share of the budget; the first one, if it is to follow the scene."""
         assert self.video_share is not None, "check() fills it"
         if not isinstance(self.video_share, str):
             return self.video_share
@@ -341,7 +341,7 @@ class EdgeConfig:
 
     @property
     def fixed_share(self) -> float | None:
-        """The same; None where it is to track the scene."""
+        """The base stream's share of the budget; None if it is to follow the scene."""
         return None if isinstance(self.video_share, str) else self.share
 
     @property
@@ -376,7 +376,7 @@ class EdgeConfig:
 
     @property
     def nominal_fps(self) -> float:
-        """Frames a second that the edge looks at; with ``--fps auto`` not all of them are sent."""
+        """Frames a second that the edge analyzes; with ``--fps auto`` not all of them are sent."""
         return DEFAULT_FPS if isinstance(self.fps, str) else self.fps
 
     @property
@@ -393,15 +393,15 @@ class EdgeConfig:
 def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
     """The configuration with the profile's settings, except for fields that the user has ``given``.
 
-    Without a profile it is auto, unless the user says which method to fly.
+    Without a profile it is auto, unless the user names a method or a regime.
     """
     profile = config.profile
     if profile is None and {"method", "regime"}.isdisjoint(given):
         profile = "auto"
     settings = {} if profile is None else {"profile": profile, **PROFILES[profile]}
-    if config.regime is not None:  # which sets the share itself
+    if config.regime is not None:  # it sets the share itself
         settings.pop("video_share", None)
-    if config.encoder != X265:  # no other takes regions
+    if config.encoder != X265:  # no other encoder takes regions
         settings.pop("roi_depth", None)
     if config.encoder == PASSTHROUGH:  # the camera decides on rate, size and bits
         settings = {**settings, "fps": AUTO, "size": None}
@@ -413,7 +413,7 @@ def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
 
 
 def check(config: EdgeConfig) -> EdgeConfig:
-    """Return the configuration with regime and shares settled; `UserError` where settings contradict."""
+    """Return the configuration with regime and shares resolved; raises `UserError` where settings contradict."""
     if config.source is None:
         raise UserError("--source is missing: give a clip, an image folder, rtsp://…, /dev/video0 or demo")
     EdgeKeys(config.edge_id)
@@ -461,7 +461,7 @@ def note_on_share(config: EdgeConfig, *, given: Mapping[str, Any]) -> str:
 
 
 def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
-    """Raise `UserError` where the budget cannot carry a base stream of this size; what a camera takes is measured.
+    """Raise `UserError` if the budget cannot carry a base stream of this size; a camera's rate is measured instead.
 
     See `least_budget_bps`, and for a camera `hvt_edge.video.encoders.passthrough`.
     """
@@ -480,8 +480,8 @@ def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
 def least_budget_bps(config: EdgeConfig, size: tuple[int, int], *, share: float) -> int:
     """The least total, whole kilobits a second, with which a base stream of this size and share works.
 
-    x265 can follow what is left to it, and each window holds the smallest keyframe of a picture with texture beside
-    what goes with it. Below that the stream would be left out for seconds, or made ever coarser.
+    x265 can follow its part of the rate, and each window holds the smallest keyframe of a textured picture and the
+    messages beside it. Below that the stream would be left out for seconds, or made ever coarser.
     """
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
     base_bps = least_base_bps(size, fps, edge_id=config.edge_id)
@@ -492,7 +492,7 @@ def least_budget_bps(config: EdgeConfig, size: tuple[int, int], *, share: float)
 
 
 def stream_text(config: EdgeConfig, size: tuple[int, int]) -> str:
-    """Such as ``1280x720 at 15 fps``: the stream that the least budget is for."""
+    """The stream that the least budget is for, such as ``1280x720 at 15 fps``."""
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
     what = f"{size[0]}x{size[1]} at {fps:g} fps"
     return what if config.window == 1 else f"{what} with --window {config.window:g}s"

@@ -1,7 +1,7 @@
 """The commands of a ground on ``control``: a keyframe, a still, the tracks, another budget or method.
 
-Runs in the link's callbacks: each answer is made at once, from what is at hand, and no command costs more than one
-crop. Who commands is not trusted: arguments have bounds, and requests a rate.
+Runs in the link's callbacks: each answer is made at once, from data at hand, and no command costs more than one
+crop. The sender of a command is not trusted: arguments have bounds, and requests a rate.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from hvt_edge.stills.requested_coding import RefusedError
 from hvt_edge.stills.scheduler import Chooser
 
 _MOST_REQUESTS = 32
-"""In a second, from all grounds together."""
+"""Requests a second, from all grounds together."""
 _REST_NS = 2 * SECOND_NS
-"""Between two changes of the budget: each costs a keyframe and the opening of an encoder."""
+"""Least time between two changes of the budget: each costs a keyframe and the opening of an encoder."""
 _MOST_BPS = 1_000_000_000
 _LEAST_CAMERA_BPS = 10_000
-"""With less the frame loop would wait for ``status`` alone."""
+"""With less the frame loop would only wait for ``status``."""
 _QUALITIES_PCT = (5, 95)
 _MOST_AGO_MS = 3_600_000
 _U32 = 2**32 - 1
@@ -56,7 +56,7 @@ class Commands:
     keyframes: Keyframes
     chooser: Chooser
     make_method: Callable[[str], Method]
-    """By its name, with the edge's settings; `UserError` for an unknown one."""
+    """Makes a method by its name, with the edge's settings; raises `UserError` for an unknown one."""
     backlog: BacklogStage | None
     base_size: tuple[int, int]
     clock: Callable[[], int]
@@ -77,7 +77,7 @@ class Commands:
         }
 
     def answer(self, request: ControlRequest) -> ControlAnswer:
-        """Do it or say why not; never raises, whatever a ground sends."""
+        """Obey the request or give the reason why not; never raises, whatever a ground sends."""
         try:
             with self._lock:
                 return self._obey(request)
@@ -204,7 +204,7 @@ class Commands:
         config, size = self.config, self.base_size
         share = FIRST_SHARE if video_share is None else video_share
         least_bps, what = least_budget_bps(config, size, share=share), stream_text(config, size)
-        if config.passes_through:  # what of a camera has no room is left out
+        if config.passes_through:  # a camera's frames without room are left out
             least_bps = max(round(_LEAST_CAMERA_BPS / share), _LEAST_CAMERA_BPS + config.metadata_bps)
             what = "a camera that is passed through"
         if budget_bps < least_bps:
@@ -238,7 +238,7 @@ def _on_demand_request(arguments: Arguments) -> OnDemandRequest:
 
 
 class _Reader:
-    # Takes a command's arguments one by one; a remaining one is one too many.
+    # Takes a command's arguments one by one; any that remains is refused.
 
     def __init__(self, command: str, arguments: Arguments) -> None:
         self._command = command

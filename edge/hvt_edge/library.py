@@ -1,7 +1,7 @@
 """An edge whose frames come from the program that it is a part of: `hvt_edge.open`.
 
-It is the edge of ``hvt-edge``, with another source. As with a camera, a frame that comes before the one before was
-taken replaces it.
+It is the edge of ``hvt-edge`` with another source. As with a camera, a new frame replaces an earlier one that was not
+taken yet.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hvt_edge.world import World
 
 _NAME = "pushed frames"
 PATIENCE_S = 5.0
-"""A program that pushes nothing for so long is said to be away, as a camera is."""
+"""A program that pushes nothing for this long is reported as away, as a camera is."""
 
 join_threads_at_exit()
 
@@ -35,7 +35,7 @@ join_threads_at_exit()
 def open_edge(**settings: object) -> PushedEdge:
     """An edge with the settings of ``hvt-edge`` (docs/options.md), such as ``connect="tcp/10.0.0.1:7447"``.
 
-    Names have underscores for dashes; what may be given several times takes a list, and a switch True or False.
+    Names have underscores for dashes; a setting that may be repeated takes a list, and a switch True or False.
     Raises `UserError` where a setting is unknown or wrong.
     """
     if "source" in settings:
@@ -48,10 +48,10 @@ def open_edge(**settings: object) -> PushedEdge:
 
 
 class PushedEdge:
-    """Sends what is pushed, until it is closed; use it with ``with``. For any thread.
+    """Sends pushed frames until it is closed; use it with ``with``. For any thread.
 
     Attributes:
-        summary: What ``--summary`` writes; empty before the end.
+        summary: The content of ``--summary``; empty before the end.
     """
 
     def __init__(self, config: EdgeConfig) -> None:
@@ -67,10 +67,10 @@ class PushedEdge:
         atexit.register(self._stop_and_join)
 
     def push(self, frame_bgr: Image, *, capture_ns: int | None = None) -> None:
-        """Hand over a frame: (height, width, 3) uint8 BGR, copied. The first one says how large the source is.
+        """Hand over a frame: (height, width, 3) uint8 BGR, copied. The first one sets the source's size.
 
-        ``capture_ns`` is when it was taken, Unix nanoseconds, a whole number; None is now. Raises `ValueError` for
-        another array or time, and `UserError` or `FlightError` once the edge has ended for that.
+        ``capture_ns`` is its capture time, Unix nanoseconds, a whole number; None is now. Raises `ValueError` for
+        another array or time, and `UserError` or `FlightError` if that has ended the edge.
         """
         taken_ns = self._clock() if capture_ns is None else _nanoseconds(capture_ns)
         if not isinstance(frame_bgr, np.ndarray):
@@ -102,7 +102,7 @@ class PushedEdge:
         try:
             self.close()
         except Exception:
-            if kind is None:  # else what the program raised goes first
+            if kind is None:  # else the program's own error goes first
                 raise
 
     def _stop_and_join(self) -> None:

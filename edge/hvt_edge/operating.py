@@ -1,8 +1,8 @@
-"""The operating point: budget, split, method and frame rate as they are now; and the keyframes that are due.
+"""The operating point: the present budget, split, method and frame rate; and the keyframes that are due.
 
-Settings are frozen; what commands, the link and measurements change lives here. Three write:
-`hvt_edge.control` what a ground commanded, the frame loop (`hvt_edge.video.reconfigure`) what the link
-allows and what x265 was opened for and with, and `hvt_edge.perception.levers` what is worth sending beside the video.
+Settings are frozen; values that commands, the link and measurements change live here. Three modules write:
+`hvt_edge.control` the ground's commands, the frame loop (`hvt_edge.video.reconfigure`) the link's rate and the
+settings of the open x265, and `hvt_edge.perception.levers` which parts are worth sending beside the video.
 The encoder, the budget, ``info``, status and summary all read the same.
 
 A keyframe comes at the start, on a long schedule, and on request of grounds, of the link, of the store: any thread
@@ -11,8 +11,8 @@ one is due stills are held, and it is sent as soon as it fits the budget's windo
 ``scheduled_patience_ns`` for that, a requested one ``patience_ns``, so that a ground that joins late sees a picture
 within a second.
 
-A ground's requests are limited by a token bucket, so that whoever may command cannot make the stream all keyframes:
-one costs the time in which its bytes are ``request_share`` of the budget. After reported losses a request is free: on
+A ground's requests are limited by a token bucket, so that no client can make the stream all keyframes: a request
+costs the time in which a keyframe's bytes are ``request_share`` of the budget. After reported losses it is free: on
 a lossy link a refused keyframe is a dark screen.
 """
 
@@ -28,9 +28,9 @@ from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 
 _MOST_RECEIVERS = 16
-"""Whose losses are remembered: ids cost a sender nothing."""
+"""Number of receivers whose losses are remembered: ids cost a sender nothing."""
 FIRST_SHARE = 0.85
-"""Of the budget, for the base, until the scene is known: between what served best on a car park (0.9) and on small
+"""The base's share of the budget until the scene is known: between the best on a car park (0.9) and on small
 objects (0.8) at 200 kbps."""
 
 
@@ -40,9 +40,9 @@ class Levers:
 
     tracks: bool = True
     stills: bool = True
-    """Those of the method; a still that a ground requests is always sent."""
+    """Stills of the method; a still that a ground requests is always sent."""
     says: str = ""
-    """Why, in one line for people; empty where nothing is measured."""
+    """The reason, in a line for the user; empty where nothing is measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +73,10 @@ class OperatingPoint:
     decimation: int
     """Each n-th source frame is coded."""
     highest_budget_bps: int
-    """Of all budgets that were in force."""
+    """The highest of all budgets that were in force."""
     preset: str = ""
     preset_says: str = ""
-    """Why it is that, in one line for people; empty where nothing had to be given up."""
+    """The reason for the preset, in a line for the user; empty where it costs no quality."""
     levers: Levers = Levers()
     started_ns: int = 0
     """When the first frame was taken; 0 before."""
@@ -97,7 +97,7 @@ class Operating:
         return self._point
 
     def start(self, now_ns: int) -> None:
-        """The first frame is about to be taken."""
+        """Note that the first frame is about to be taken."""
         self._set(started_ns=now_ns)
 
     def command(self, *, budget_bps: int, video_share: float | None, method: str) -> None:
@@ -119,7 +119,7 @@ class Operating:
         self._set(preset=preset, preset_says=says)
 
     def pull(self, levers: Levers) -> None:
-        """Decide anew, by the measurements, which parts are sent beside the video."""
+        """Set which parts are sent beside the video, as decided by the measurements."""
         self._set(levers=levers)
 
     def _set(self, **changes: object) -> None:
@@ -128,7 +128,7 @@ class Operating:
 
 
 class LoopClock:
-    """The time that the budget's windows go by: the wall clock, or in lockstep the newest frame's capture time.
+    """The time of the budget's windows: the wall clock, or in lockstep the newest frame's capture time.
 
     ``wait(seconds)`` sleeps; in lockstep nothing is waited for.
     """
@@ -145,22 +145,22 @@ class LoopClock:
         return self._media_ns if self._lockstep else self._clock()
 
     def advance(self, capture_ns: int) -> None:
-        """The loop has come to this frame."""
+        """Note that the loop has come to this frame."""
         self._media_ns = capture_ns
 
     def wait_until(self, at_ns: int) -> None:
-        """Sleep until then, as the budget's window makes room."""
+        """Sleep until the time at which the budget's window has room."""
         if not self._lockstep and (wait_ns := at_ns - self._clock()) > 0:
             self._wait(wait_ns / SECOND_NS)
 
     def pause(self, pause_ns: int) -> int:
-        """Sleep for so long; return the time then."""
+        """Sleep for ``pause_ns``; return the time after it."""
         self.wait_until(self() + pause_ns)
         return self()
 
 
 def base_rate_bps(total_bps: int, share: float, *, metadata_bps: int) -> int:
-    """B_v of so much in all, less the rate of tracks."""
+    """B_v of this total, at most all but the rate of tracks."""
     return round(min(total_bps * share, total_bps - metadata_bps))
 
 
@@ -172,19 +172,19 @@ class KeyframeSettings:
     patience_ns: int = 3 * SECOND_NS // 5
     scheduled_patience_ns: int = 2 * SECOND_NS
     rest_ns: int = 3 * SECOND_NS // 10
-    """After a keyframe, requests are taken as answered by it for so long at most: they crossed it on the way. With
+    """Longest time after a keyframe for which it answers new requests: they crossed it on the way. With
     the second request of a ground (0.3 s after the first) and the patience it stays under a second."""
     coding_ns: int = SECOND_NS // 10
-    """A keyframe is coded and put on the line for so long: with the round trip, a request crosses it for as long."""
+    """Time to code a keyframe and put it on the line: with the round trip, a request crosses it for as long."""
     burst: int = 6
     """Requests in a row: losses come in bursts."""
     refill_ns: int = 7 * SECOND_NS // 10
-    """After that one in so long at the most, where losses were reported too; 0 for no limit. On a link that loses one
-    frame in twenty, two seconds would show half of what 0.7 s shows."""
+    """After the burst, least time between two requests, where losses were reported too; 0 for no limit. On a link
+    that loses one frame in twenty, two seconds would show half of the frames that 0.7 s shows."""
     request_share: float = 0.35
-    """Share of the budget for keyframes that nobody needs as far as the edge can tell."""
+    """Share of the budget for requested keyframes without reported losses."""
     camera_every_s: float | None = None
-    """The camera makes its own keyframes, about so far apart, and none on request; None: the edge makes them."""
+    """The usual time between the camera's own keyframes, which makes none on request; None: the edge makes them."""
 
 
 class Keyframes:
@@ -200,17 +200,17 @@ class Keyframes:
         self._requested_ns: int | None = None
         """The oldest request that no keyframe has met."""
         self._by_ground = False
-        """Of these one is a ground's."""
+        """Whether one of the open requests is a ground's."""
         self._paid_ns = -(2**63)
         """Requests are paid for up to this time: `_cost_ns` each."""
         self._keyframe_ns = 0
         """The cost of a keyframe, as time of the budget."""
         self._crosses_ns = self.settings.rest_ns
-        """After a keyframe, a request of so long may be from before it came."""
+        """For this long after a keyframe, a request may have been sent before it arrived."""
         self._losses: Newest[int, int] = Newest(_MOST_RECEIVERS)
         """Losses by receiver, as of its last report."""
         self._lossy = False
-        """Whether somebody has lost more since the last keyframe."""
+        """Whether a receiver has lost more since the last keyframe."""
         self.sent = 0
         """Keyframes so far."""
         self.served = 0
@@ -219,32 +219,32 @@ class Keyframes:
     # Anybody
 
     def due(self, now_ns: int) -> bool:
-        """Whether a keyframe is to come: stills are held from now on until it has gone."""
+        """Whether a keyframe is due: stills are held from now on until it is sent."""
         with self._lock:
             return self._requested_ns is not None or self._due_ns is not None or self._scheduled(now_ns)
 
     @property
     def made_here(self) -> bool:
-        """Whether they come when the edge wants one; a camera makes its own."""
+        """Whether the edge makes the keyframes; a camera makes its own."""
         return self.settings.camera_every_s is None
 
     @property
     def requested(self) -> bool:
-        """Whether a keyframe is to come that somebody or something needs: not even a requested still goes before."""
+        """Whether a keyframe is due on request or at the start: not even a requested still goes before it."""
         with self._lock:
             return self._requested_ns is not None or self._last_ns is None
 
     @property
     def awaited(self) -> bool:
-        """Whether a ground waits for one: it can show no other frame, and each would take of the keyframe's room."""
+        """Whether a ground waits for one: it can show no other frame, and each would use the keyframe's room."""
         with self._lock:
             return self._by_ground
 
     def request(self, now_ns: int) -> str | None:
-        """A ground wants a keyframe; return why it gets none now, in a sentence, or None where it is served.
+        """A ground requests a keyframe; return the reason for a refusal, in a sentence, or None where it is served.
 
-        What costs no keyframe of its own is always served: one is due already, or the newest one is so fresh that it
-        crossed the request on the way.
+        A request that costs no keyframe of its own is always served: one is due already, or the newest one is so
+        fresh that it crossed the request on the way.
         """
         if self.settings.camera_every_s is not None:
             return (
@@ -266,16 +266,16 @@ class Keyframes:
             return None
 
     def require(self, now_ns: int) -> None:
-        """The edge itself wants one, because something is to change with it; a camera's next one will do."""
+        """The edge itself needs one, because a setting changes with it; a camera's next one will do."""
         if not self.made_here:
             return
         with self._lock:
             self._add(now_ns)
 
     def report_losses(self, receiver_id: int, count: int) -> None:
-        """A receiver reports so many lost or damaged messages in all; its next request is free.
+        """A receiver reports its total of lost or damaged messages; after an increase its next request is free.
 
-        It counts from 0 again after it has taken the link for lost.
+        It counts from 0 again after it has declared the link lost.
         """
         with self._lock:
             before = self._losses.get(receiver_id, 0)
@@ -283,7 +283,7 @@ class Keyframes:
             self._lossy |= count > before
 
     def note_round_trip(self, round_trip_ns: int) -> None:
-        """The link's round trip; a request that comes later than that after a keyframe says that it was lost."""
+        """Note the link's round trip; a request that comes later than that after a keyframe means it was lost."""
         self._crosses_ns = min(self.settings.rest_ns, round_trip_ns + self.settings.coding_ns)
 
     # The frame loop
@@ -300,14 +300,14 @@ class Keyframes:
             return self._due_ns is not None and (fits or not self._waits(self._due_ns, now_ns))
 
     def done(self, now_ns: int) -> None:
-        """A keyframe has just been encoded; it also answers what was requested meanwhile."""
+        """A keyframe has just been encoded; it also answers requests made meanwhile."""
         with self._lock:
             self._last_ns, self._due_ns, self._requested_ns, self._by_ground = now_ns, None, None, False
             self._lossy = False  # losses before it are no reason any more
             self.sent += 1
 
     def note_cost(self, keyframe_ns: int) -> None:
-        """A keyframe has been sent that takes the whole budget for so long."""
+        """Note the cost of a keyframe that was sent, as time of the whole budget."""
         self._keyframe_ns = keyframe_ns
 
     def _add(self, now_ns: int) -> None:
@@ -327,7 +327,7 @@ class Keyframes:
         return max(self.settings.refill_ns, round(self._keyframe_ns / self.settings.request_share))
 
     def _pay(self, now_ns: int, *, last_ns: int) -> str | None:
-        # Take a token; return why not, where there is none. After a loss nobody pays.
+        # Take a token; return the reason where there is none. After a loss a request is free.
         settings, cost_ns = self.settings, self._cost_ns
         if settings.refill_ns == 0 or (self._lossy and now_ns - last_ns >= settings.refill_ns):
             return None

@@ -1,4 +1,4 @@
-"""Settings in one word: the values of ``--profile`` and ``--regime``. A flag or a file that says otherwise wins."""
+"""Settings in one word: the values of ``--profile`` and ``--regime``. A flag or a file overrides them."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _PAPER = {"method": "M5", "still_codec": "jpeg", "video_share": 0.8125}
 
 PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
-        "auto": MappingProxyType(_THIN),  # and what pays of it is measured (`EdgeConfig.measures`)
+        "auto": MappingProxyType(_THIN),  # their gain is measured (`EdgeConfig.measures`)
         "paper": MappingProxyType(_PAPER),
         "thin": MappingProxyType(_THIN),
-        # What hvt-study compare calls so (docs/compare.md); M0 and R0 are methods.
+        # The names of hvt-study compare (docs/compare.md); M0 and R0 are methods.
         "M0-fps": MappingProxyType({"method": "M0", "fps": "auto"}),
         "M0-best": MappingProxyType({"method": "M0", "fps": "auto", "size": "auto"}),
         "M5-jpeg": MappingProxyType({"method": "M5", "still_codec": "jpeg"}),
@@ -40,7 +40,7 @@ PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Regime:
-    """A budget of the paper: so much in all, so much of it for video."""
+    """A budget of the paper: the total, and the share for video."""
 
     budget_bps: int
     video_share: float

@@ -24,7 +24,7 @@ from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_u
 
 
 class World:
-    """The real one."""
+    """The world of a real flight."""
 
     def __init__(self) -> None:
         self.session_id = 1 << 31 | secrets.randbits(31)  # 5 bytes in each header, where 64 bits take 9
@@ -39,11 +39,11 @@ class World:
         return make_detector(config)
 
     def warm_up(self, config: EdgeConfig, detector: Detector, source: Source) -> None:
-        """Before the first frame: a runtime may compile for the size of the pictures."""
+        """Prepare the detector before the first frame: a runtime may compile for the size of the pictures."""
         warm_up_for(config, detector, source.view)
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """Open ``--source``. Raises `UserError` if nothing usable is there, `FlightError` where its disk may come."""
+        """Open ``--source``. Raises `UserError` if nothing usable is there, `FlightError` if a disk may yet come."""
         assert config.source is not None, "check() refuses a missing source"
         if is_local(config.source) and not config.follow and absent(Path(config.source)) is NotYetError:
             raise FlightError(

@@ -1,7 +1,7 @@
 """The state of an edge at one moment, as one value.
 
-Made once a second (`Heartbeat`). Status line, the wire's `Status`, metrics and ``hvt-edge status`` read from it what
-they have in common, so that none of them says what another does not. What is not known is None, never 0.
+Made once a second (`Heartbeat`). Status line, the wire's `Status`, metrics and ``hvt-edge status`` all read from it,
+so that they never contradict each other. Unknown values are None, never 0.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from hvt_edge.operating import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
 _LEAST_OLD_S = 1.5
-"""Boxes that are younger are not called old."""
+"""Boxes that are younger do not count as old."""
 _SILENT_S = 3.0
-"""A source that has given no frame for so long, and two frames longer, has failed."""
+"""A source that has given no frame for this long, and two frames longer, has failed."""
 _ZONES = "sys/class/thermal/thermal_zone*/temp"
 _WIRELESS = "proc/net/wireless"
 _HEAD_LINES = 2
@@ -44,17 +44,17 @@ Phase = Literal["waiting", "running", "ended"]
 
 @dataclass(frozen=True, slots=True)
 class SystemReading:
-    """The machine's temperature and the quality of its wireless link; None where the system does not tell."""
+    """The machine's temperature and the quality of its wireless link; None where the system gives none."""
 
     temperature_c: float | None = None
     """The temperature of the hottest zone."""
     wireless_quality: float | None = None
-    """The driver's count, of 70 with most."""
+    """The driver's count, of 70 with most drivers."""
     wireless_dbm: float | None = None
 
 
 def read_system(root: Path = Path("/")) -> SystemReading:
-    """Read it now; ``root`` is where ``sys`` and ``proc`` are."""
+    """Read the present values; ``root`` is the folder of ``sys`` and ``proc``."""
     quality, level = _wireless(root / _WIRELESS)
     return SystemReading(_hottest_c(root), quality, level)
 
@@ -73,7 +73,7 @@ def _wireless(path: Path) -> tuple[float | None, float | None]:
     with contextlib.suppress(OSError, ValueError, IndexError):
         _, _, rest = path.read_text(encoding="ascii").splitlines()[_HEAD_LINES].partition(":")
         _, quality, level = (float(one) for one in rest.split()[:3])
-        return quality, level if level < 0 else None  # above, a driver of old counts in units of its own
+        return quality, level if level < 0 else None  # above, an old driver counts in units of its own
     return None, None
 
 
@@ -84,14 +84,14 @@ class OperatingState:
     source_size: tuple[int, int]
     base_size: tuple[int, int]
     fps: float
-    """Frames a second that are coded, where nothing is dropped."""
+    """Frames a second that are coded, if none is dropped."""
     decimation: int
     profile: str | None
     preset: str
     preset_says: str
-    """Why it is a faster one than it would be with more time; empty where it is not."""
+    """The reason for a faster preset than with more time; empty for the usual one."""
     budget_bps: int
-    """As set or commanded."""
+    """The budget as set or commanded."""
     allowed_bps: int
     """The rate that may be sent now: less than the budget if the link carries less."""
     base_budget_bps: int
@@ -100,10 +100,10 @@ class OperatingState:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Since the start."""
+    """Frame counts since the start."""
 
     account: FrameAccount
-    """The outcome of each."""
+    """The outcome of each frame."""
     encoded: int
     unanalyzed: int
     """Skipped by perception for want of time."""
@@ -116,18 +116,18 @@ class LinkState:
     ground: bool
     """Whether a ground listens."""
     since_ns: int
-    """Since when that is so. Unix time."""
+    """Unix time of the last change of ``ground``."""
     watched: bool
-    """Whether anybody listens to the video, also who reports nothing."""
+    """Whether any program subscribes to the video, also one that reports nothing."""
     trouble: str | None
-    """Why no ground can be reached, where that is known."""
+    """The reason why no ground can be reached, where that is known."""
     reported_s: float | None
-    """Since a ground reported last."""
+    """Time since the last report of a ground."""
     round_trip_ms: float | None
     rate_bps: int | None
-    """The measured rate of the link; None if nobody measures it."""
+    """The measured rate of the link; None if it is not measured."""
     unusable_messages: int
-    """Of grounds: damaged, foreign, or of another version."""
+    """Messages from grounds that were damaged, foreign, or of another version."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +143,13 @@ class BacklogState:
     disk_bytes: int
     limit_bytes: int
     disk_free_bytes: int | None
-    """Of the disk that it lies on; None where that does not answer."""
+    """Free bytes of the store's disk; None where it does not answer."""
     frames_stored: int
-    """By this session."""
+    """Frames stored by this session."""
     sent_stills: int
     sent_video_s: float
     evicted_stills: int
-    """Given up for want of space."""
+    """Deleted for want of space, like the next."""
     evicted_segments: int
 
 
@@ -161,16 +161,16 @@ class EdgeState:
     """Unix time, as all times here."""
     version: str
     schema_version: int
-    """Of the messages on the wire."""
+    """Version of the messages on the wire."""
     edge: str
     session: str
-    """Its id, hexadecimal."""
+    """The session's id, hexadecimal."""
     state: Phase
     lockstep: bool
     duration_s: float
     method: str
     levers: Levers
-    """What is sent beside the video, and why."""
+    """The parts sent beside the video, and the reason."""
     operating: OperatingState
     total_bps: float | None
     """Over the budget's window, like those below; None before the first frame."""
@@ -182,29 +182,29 @@ class EdgeState:
     """The used share of the allowed rate."""
     frames: Frames
     source_silent_s: float | None
-    """Since the source gave its last frame; None before the first."""
+    """Time since the source gave its last frame; None before the first."""
     keyframes: int
     keyframe_requests: int
-    """Of grounds, that were served."""
+    """Requests of grounds that were served."""
     stills_sent: int
     stills_pending: int
     stills_in_flight: int
     """Sent, and in no report yet."""
     stills_not_sent: Mapping[str, int]
-    """Why candidates have no still, by reason."""
+    """Number of candidates without a still, by reason."""
     tracks: int
     encode_ms: float | None
     """Mean of one frame, since the start; like the next."""
     perception_ms: float | None
     boxes_age_s: float | None
-    """From the picture in which objects were last searched for to the newest one; None before the first search, and
-    while no picture comes."""
+    """Age, at the newest frame, of the frame in which objects were last searched for; None before the first search,
+    and while no picture comes."""
     detection_slow: bool
     """Boxes are older than they would be if detection had its time."""
     cores_needed: float | None
-    """Processor cores for every frame, had none been left out."""
+    """Processor cores that all frames would need, had none been left out."""
     cores_free: float | None
-    """That other processes leave."""
+    """Cores that other processes leave."""
     system: SystemReading
     link: LinkState
     backlog: BacklogState | None
@@ -218,7 +218,7 @@ class EdgeState:
 
 
 def lacks(state: EdgeState) -> str:
-    """Why an edge whose loop turns sends no pictures; empty for no reason."""
+    """The reason why an edge whose loop turns sends no pictures; empty for none."""
     if state.state == "waiting":
         return "it waits for a ground"
     silent_s, operating = state.source_silent_s, state.operating
@@ -235,9 +235,9 @@ def _patience_s(fps: float) -> float:
 def boxes_age_s(
     detected_ns: int | None, *, newest_ns: int | None, resumed_ns: int, silent: bool, usual_s: float
 ) -> tuple[float | None, bool]:
-    """See `EdgeState.boxes_age_s`, and whether detection is slow; ``usual_s`` is their age where it has its time.
+    """`EdgeState.boxes_age_s`, and whether detection is slow; ``usual_s`` is the age if detection has its time.
 
-    ``resumed_ns``: when the source last gave pictures again; before, there was nothing to search.
+    ``resumed_ns``: when the source last gave pictures again; before that there was nothing to search.
     """
     if newest_ns is None or detected_ns is None or silent:
         return None, False
@@ -271,7 +271,7 @@ class Heartbeat:
         self._ground, self._since_ns = False, self.clock()
         self._due_ns = 0
         self.state: EdgeState | None = None
-        """The newest; None before the first. Any thread may read it."""
+        """The newest state; None before the first. Any thread may read it."""
 
     @property
     def frames(self) -> FrameAccount:
@@ -285,7 +285,7 @@ class Heartbeat:
         return self.state
 
     def turn(self, phase: Phase) -> None:
-        """Make one if the last is a second old."""
+        """Make a state if the last is a second old."""
         if self.clock() >= self._due_ns:
             self.beat(phase)
 

@@ -28,11 +28,11 @@ from hvt_edge.report.state import EdgeState, Heartbeat, LinkState
 
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
 _MOST_MS, _MOST_AGE_MS, _MOST_CORES = 60_000.0, 2**32 - 1, 4096.0
-"""The largest numbers that a report can say."""
+"""The largest numbers that a report can hold."""
 _LEVERS_REST = 10
 _REPORTED: tuple[StillOutcome, ...] = ("sent", "deferred", "dropped")
 _LATE_NS = 2 * SECOND_NS
-"""A report that has waited so long for what video leaves goes before the next frame: grounds live by it too."""
+"""A report that has waited this long for room beside video goes before the next frame: grounds need it too."""
 
 
 @dataclass(eq=False)
@@ -47,11 +47,11 @@ class InfoReporter:
     class_names: tuple[str, ...]
     channels: tuple[Channel, ...]
     still_codecs: Callable[[], tuple[str, ...]]
-    """Those of the stills that are sent now."""
+    """The codecs of the stills that are sent now."""
     clock: Callable[[], int]
 
     def info(self, received_ns: int | None = None) -> bytes:
-        """The session's facts for a ground; times are of the clock of the headers."""
+        """The session's facts for a ground; times are by the clock of the headers."""
         config, view, now = self.config, self.view, self.operating.now
         answered_ns = self.clock()
         info = Info(
@@ -80,7 +80,7 @@ class InfoReporter:
 
 
 class StatusReporter:
-    """Sends ``status``, from the state that the heartbeat has made and the parts that it knows; in the frame loop."""
+    """Sends ``status``, from the heartbeat's state and its parts; in the frame loop."""
 
     def __init__(self, heartbeat: Heartbeat) -> None:
         self._of = heartbeat
@@ -95,13 +95,13 @@ class StatusReporter:
     def send(self, phase: Literal["running", "ended"]) -> None:
         """Make the report of this second, and send it as soon as it leaves video its room; the last one waits."""
         state = self._of.beat(phase)
-        # Once: the transmitter makes a report twice, first for its size.
+        # Made once: the transmitter packs a report twice, first for its size.
         self._pending = (state, self._levers_text(state.levers))
         self._due_ns = self._of.loop_clock() if self._due_ns is None else self._due_ns
         self.send_pending(last=phase == "ended")
 
     def send_pending(self, *, last: bool = False) -> None:
-        """Before each frame: a report that found no room is tried again."""
+        """Called before each frame: a report that found no room is tried again."""
         if self._pending is None:
             return
         (state, levers), now_ns = self._pending, self._of.loop_clock()
@@ -117,7 +117,7 @@ class StatusReporter:
             self._sequence += 1
 
     def _levers_text(self, levers: Levers) -> str:
-        # Where a lever was moved, and now and then: on a thin link a sentence a second is not free.
+        # Sent after a change of a lever, and now and then: on a thin link a sentence a second is not free.
         sent = self._reported
         moved = sent is None or (levers.tracks, levers.stills) != (sent.tracks, sent.stills)
         if not levers.says or (not moved and self._sequence - self._reported_sequence < _LEVERS_REST):
@@ -215,7 +215,7 @@ def _link_text(link: LinkState) -> str:
 def summary(of: Heartbeat, *, unreached: str) -> dict[str, Any]:
     """The JSON summary; rates count every byte on the line: payload, attachments, transport overhead.
 
-    ``unreached`` says why nobody had its video; empty where somebody had.
+    ``unreached`` is the reason why no program received its video; empty where one did.
     """
     config, counts, now, ledger, frames = of.config, of.counts, of.operating.now, of.ledger, of.frames
     keyframes, analyzer, cores = of.stills.keyframes, of.stills.analyzer, counts.cpu.short
@@ -264,7 +264,7 @@ def summary(of: Heartbeat, *, unreached: str) -> dict[str, Any]:
 
 
 def in_vain(content: dict[str, Any]) -> bool:
-    """Whether pictures were made of which nobody received one, and none is stored for later."""
+    """Whether pictures were made of which none was received, and none is stored for later."""
     return bool(content["unreached"] and content["frames"] and not content["frames_stored"])
 
 
@@ -278,7 +278,7 @@ def title(content: dict[str, Any]) -> str:
 
 
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """The same as rows of name and value; a flight that nobody received has fewer rows."""
+    """The same as rows of name and value; a flight that was not received has fewer rows."""
     stills, worst = content["stills"], content["worst_window_bps"]
     total = content["total_bps"]
     share = f"{total / content['budget_bps']:.0%} of {bitrate_text(content['budget_bps'])}"
