@@ -254,7 +254,7 @@ class Edge:
         first = with_lower_priority(opened, stop=self._stop)
         if first is None:  # stopped before it is open
             return unopened(config, lambda: world.open_detector(config))
-        # Not kept beside the detector opened in its place once it has failed: each holds 100 MB.
+        # A failed detector is not kept beside the one opened in its place: each holds 100 MB.
         ready = [first]
         return RetriedDetector(
             lambda: ready.pop() if ready else world.open_detector(config),

@@ -216,7 +216,7 @@ class Keyframes:
         self.served = 0
         """Requests of grounds that were met by a keyframe of their own, or one that was due or fresh."""
 
-    # Anybody
+    # Any thread
 
     def due(self, now_ns: int) -> bool:
         """Whether a keyframe is due: stills are held from now on until it is sent."""

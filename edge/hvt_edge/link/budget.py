@@ -134,7 +134,7 @@ class VideoLoan:
         self._wanted = None
 
     def take(self, line_bytes: int, *, now_ns: int) -> None:
-        """A requested still goes out."""
+        """Note a requested still that is sent."""
         self._wanted = None
         self._taken.append((now_ns, line_bytes))
 

@@ -50,7 +50,7 @@ _MOST_RECORDS = 1024
 _RESEND_NS = SECOND_NS
 """An older access unit is not sent again: a keyframe has been requested by then."""
 _AGAIN_NS = 30 * _MS
-"""Beyond one and a half round trips: after both a unit that was sent again counts as lost once more."""
+"""Time beyond one and a half round trips after which a unit that was sent again counts as lost once more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Sent:
     sequence: int
     sent_ns: int
     serialization_ns: int
-    """From its sending until a link of the present rate has carried it."""
+    """Time from its sending until a link of the present rate has carried it."""
     line_bytes: int
     up_to_bytes: int
     """Line bytes of everything sent so far, this message included."""

@@ -41,7 +41,7 @@ _MOST_PER_S = 1000
 """Requests, or reports: a ground sends about ten a second."""
 _AGAIN_NS = {Channel.INFO: (2 * SECOND_NS,) * 2}
 _AGAIN_NS |= dict.fromkeys((Channel.CONTROL, Channel.FEEDBACK), (2 * SECOND_NS, 64 * SECOND_NS))
-"""First and longest pause before a channel is declared anew. A ground asks for info within a fraction of it; some
+"""First and longest pause before a channel is declared anew. A ground queries info within a fraction of it; some
 grounds never command, some never report."""
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
 """Channels that every ground subscribes to; one that only shows the video may leave out the others."""

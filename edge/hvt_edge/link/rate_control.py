@@ -33,7 +33,7 @@ _FEW_MESSAGES, _LOSS_MESSAGES = 20, 100
 """Loss among fewer messages than the first says nothing; from the second on its share is used as measured."""
 _LOSS_DEVIATIONS = 2.0
 _MUCH_LESS, _MUCH_MORE = 0.8, 1.25
-"""Below or above these ratios of the base's rate x265 is opened anew at once."""
+"""x265 is opened anew at once where the wanted rate is below or above these multiples of the base's."""
 _SOME_OFF, _SOME_NS = 0.08, 3 * SECOND_NS
 """A difference of this share leads to a new opening after this time."""
 _LITTLE_OFF = 0.02

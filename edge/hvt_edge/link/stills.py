@@ -28,7 +28,7 @@ Place = tuple[slice, slice]
 
 _BT601 = np.array([[0.114, 0.587, 0.299]], np.float32)
 _FAR_OFF_SHARE = 0.5
-"""With half of the crop's own variance in the difference to the base, there is little in the base to build on."""
+"""Share of the crop's variance in the difference to the base above which the base is too far off to build on."""
 _NO_PIXELS: Image = np.empty((0, 0, 3), np.uint8)
 _PLAIN_ENCODING = "application/octet-stream"
 """The encoding of formats that only HVT reads; one byte on the wire."""
@@ -96,7 +96,7 @@ class Still:
     base_crop_bgr: Image | None = field(default=None, repr=False, compare=False)
     """The same region in the decoded base frame of the same source frame, at that size; None without one."""
     alternative: Alternative | None = field(default=None, repr=False, compare=False)
-    """None where the base was not at hand."""
+    """The base's crop as a comparison; None where the base was not at hand."""
     data: bytes = b""
 
     @classmethod

@@ -29,7 +29,7 @@ _AHEAD_S = 1.0
 _GROUND_GONE_S = 20.0
 """The loop does not wait again for a ground that has not answered for this long."""
 _UNSUBSCRIBED_S = 2.0
-"""Nor for one that has not subscribed for this long; a link may break and come back."""
+"""The same for a ground that has not subscribed for this long; a link may break and come back."""
 _STOP_S = 0.3
 """How long the loop waits for the ground when the run is to stop."""
 _POLL_S = 0.1

@@ -277,7 +277,7 @@ class LinkControl:
             return
         try:
             self._apply(feedback, now_ns=self.clock())
-        except Exception as error:  # noqa: BLE001 - in a thread of the link, where nobody would notice it
+        except Exception as error:  # noqa: BLE001 - in a thread of the link, where it would go unnoticed
             self.failures.failed(_PART, f"a report failed ({type(error).__name__}: {error})")
             if self.pacer is not None:
                 self.pacer.on_fault(self.clock())

@@ -135,7 +135,7 @@ class Candidate:
     """A detection of this very frame was matched; False while the box is only predicted."""
     touches_border: bool = False
     border_s: float = 0.0
-    """For how long it has touched the border without a break."""
+    """How long it has touched the border without a break."""
     leaving: bool = False
     """The box touches the border, and less of the object shows than before."""
     covered_share: float = 0.0

@@ -31,7 +31,7 @@ _MOST_DETECTING: Final = 0.85
 """Shares of the cores that the earlier parts have left."""
 _LEAST_CORES: Final = 0.5
 _SHARE: Final = 0.5
-"""With fewer than 3 detections a second nothing is tracked from a moving camera: with 1.5 a third is (car10)."""
+"""With fewer than 3 detections a second tracking from a moving camera fails: with 1.5 it holds a third (car10)."""
 _IDLE: Final = 0.1
 """Share of the processors given to no part: a process that uses all that its control group allows is halted
 for the rest of each tenth of a second, and its video with it."""
@@ -44,7 +44,7 @@ _LOSS_NS: Final = SECOND_NS // 4
 _START_NS: Final = SECOND_NS
 """Frames lost this early say nothing: the first is the dearest to code, and all other parts begin beside it."""
 _MOST_QUEUED: Final = 3
-"""With more frames behind the one in hand detection is left out: they would wait as long again."""
+"""Most frames behind the one in hand while detection may begin: they would wait as long again."""
 _NEWEST: Final = 0.3
 """Weight of the newest cost in the mean."""
 

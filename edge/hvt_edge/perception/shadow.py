@@ -43,7 +43,7 @@ from hvt_edge.perception.levers import Measured
 _MOST_OPEN = 32
 """Comparisons that wait for a report: half a minute of them."""
 _LEAST_WORTH = 0.5
-"""Least weight of comparisons: with less nothing is known; the last one counts for some twenty seconds."""
+"""Least weight of comparisons: below it nothing is known; the last one counts for some twenty seconds."""
 _LEAST_MORE = 0.5
 """Least difference between the ground's number of objects and the edge's."""
 _BASE_NAMES = 1 / 3
@@ -68,7 +68,7 @@ class Detected:
     receiver_id: int
     """The ground's number."""
     frame_index: int
-    """The last frame that it was done with."""
+    """The last frame that it has processed."""
     objects: int
     """Number of objects that it showed at its last detection up to that frame."""
 

@@ -137,7 +137,7 @@ class BacklogState:
     offline: bool
     """Frames and stills go into the store now."""
     stills: int
-    """In the store, like the two below."""
+    """Number in the store, like the two below."""
     segments: int
     video_s: float
     disk_bytes: int
@@ -173,7 +173,7 @@ class EdgeState:
     """The parts sent beside the video, and the reason."""
     operating: OperatingState
     total_bps: float | None
-    """Over the budget's window, like those below; None before the first frame."""
+    """Rate over the budget's window, like those below; None before the first frame."""
     base_bps: float | None
     roi_bps: float | None
     backlog_bps: float | None

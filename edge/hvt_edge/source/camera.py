@@ -22,7 +22,7 @@ from hvt_edge.source.decoding.pictures import Stretch
 from hvt_edge.source.live import Shot, SignalLost, patience_s
 
 _REQUESTED_SIZE = (1920, 1080)
-"""Requested of the camera, which takes the nearest it has. Stills live on the pixels beyond the base size."""
+"""Requested of the camera, which takes the nearest it has. Stills use the pixels beyond the base size."""
 
 _Y16 = cv2.VideoWriter.fourcc(*"Y16 ")
 

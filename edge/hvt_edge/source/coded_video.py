@@ -119,9 +119,7 @@ class CodedVideoSource(ClipSource):
         # (seconds, packet) in order; a jump of the time stamps is mended, and logged if ``say``.
         timeline = self._stamps.timeline(stream)
         for packet in packets_of(container, stream):
-            if (
-                isinstance(packet, Exception) or not packet.size
-            ):  # a file that breaks off is played up to there
+            if isinstance(packet, Exception) or not packet.size:  # a broken file plays so far
                 continue
             self._hidden += packet.is_discard
             usable = self._stamps.usable and packet.pts is not None

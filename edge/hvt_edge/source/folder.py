@@ -145,9 +145,6 @@ def _bgr(file: Path, stretch: Stretch, *, at_s: float) -> Image | None:
             return stretch.bgr(image, at_s=at_s)
         # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    except (
-        OSError,
-        cv2.error,
-    ):  # it was there a moment ago, or its header claims a size that no memory holds
+    except (OSError, cv2.error):  # it has just gone, or its header claims too large a size
         return None
     return None if image is None else np.asarray(image, np.uint8)

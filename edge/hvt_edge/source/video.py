@@ -100,7 +100,7 @@ class VideoSource(ClipSource):
     def _shown(
         self, frames: Iterable[tuple[Fraction, av.VideoFrame]]
     ) -> Iterator[tuple[Fraction, av.VideoFrame]]:
-        # Without combs; such a frame comes when the next has been seen, and keeps its time.
+        # Deinterlaces: such a frame comes when the next has been decoded, and keeps its time.
         times: deque[Fraction] = deque()
         for at_s, frame in frames:
             times.append(at_s)

@@ -374,7 +374,7 @@ class OnDemand:
         self._ended = True
 
     def _want_tracks(self, capture_ns: int) -> None:
-        # Note that tracks are wanted; raises `RefusedError` if there are none yet because nobody wanted them.
+        # Note that tracks are wanted; raises `RefusedError` if there are none yet because none were wanted before.
         self._tracks_requested_ns = capture_ns
         if not self._tracked:
             raise RefusedError(

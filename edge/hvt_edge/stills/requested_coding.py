@@ -33,7 +33,7 @@ class RefusedError(Exception):
 _BEST_PCT = 95
 _STEP_PCT = 10
 _FLOOR_PCT = 20
-"""Below it a smaller picture of better quality shows more."""
+"""Quality below which a smaller picture of better quality shows more."""
 _FILLED = 0.85
 """The search ends with a still that fills this share of its limit: a large picture is coded in half the time."""
 _SHRINKS = (0.7, 0.5, 0.35, 0.25)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
 _WORTH = 0.04
-"""At a keyframe that is due anyway, a base rate off by less than this stays as it is."""
+"""Least change of the base rate, as a share, at a keyframe that is due anyway."""
 
 OpenEncoder = Callable[[Rates], Encoder]
 """Opens the encoder for these rates."""
@@ -263,7 +263,7 @@ class Split:
     metadata_bps: int = 0
     """The rate of the ``tracks`` channel: part of neither the base's share nor the stills'."""
     visible_base_bps: int = 160_000
-    """Below it the base loses objects that it would else show, more than stills give back (1280x720 at 15 fps)."""
+    """Rate below which the base loses more objects than stills give back (1280x720 at 15 fps)."""
     least_still_share: float = 0.05
     """Least share of stills, for new tracks and for stills that a ground requests."""
     most_still_share: float = 0.35

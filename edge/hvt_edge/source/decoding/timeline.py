@@ -128,6 +128,6 @@ class Timeline:
             self.jumps.append((self._at_s, step_s))
             self._former_s, self._offset_s = self._offset_s, expected_s - stamp_s
         elif self._former_s is not None and step_s > near_s >= abs(stamp_s + self._former_s - expected_s):
-            self._offset_s = self._former_s  # those between came late: around damage, or by damaged stamps
+            self._offset_s = self._former_s  # frames between came late: around damage, or by damaged stamps
         at_s = stamp_s + self._offset_s
         return at_s if at_s > self._at_s else self._at_s + self._period_s / 2

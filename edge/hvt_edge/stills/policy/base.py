@@ -24,10 +24,10 @@ ALSO_BYTES = 17.0
 """Bytes of the header for each further track: its id and its box in eighths of a pixel."""
 MOST_ALSO = 15
 _MOST_COMPARED = 96
-"""Of more requests only the most useful are compared with each other, which bounds the time."""
+"""Number of requests, the most useful ones, that are compared with each other; it bounds the time."""
 _LEAST_SAVING_BYTES = 1.0
 STILL_OVERHEAD_BYTES = 147.0
-"""With the usual names: 56 of header and 83 of framing and TCP for JPEG, 9 more for a residual."""
+"""Bytes with the usual names: 56 of header and 83 of framing and TCP for JPEG, 9 more for a residual."""
 _PRIOR_FIXED_BYTES = 640.0
 _PRIOR_BYTES_PER_PX = 0.12
 _PRIOR_MEAN_BYTES = 1500.0

@@ -80,9 +80,9 @@ class Uncertain(Method):
     """M3: confidence below a threshold: the classifier's once the ground has named the track, else the detector's."""
 
     detector_confidence: float = 0.5
-    """Below it the detector is unsure (0.50 is the strictest confidence in the pilot's table)."""
+    """Confidence below which the detector is unsure (0.50 is the strictest confidence in the pilot's table)."""
     classifier_confidence: float = 0.5
-    """Below it no class has the absolute majority."""
+    """Confidence below which no class has the absolute majority."""
     name: ClassVar[str] = "M3"
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
