@@ -1,1 +1,1 @@
-"""Keeps on disk what was computed once, named by content and code: `ResultCache`, `CachedDetector`, `code_digest`."""
+"""Keeps computed results on disk, named by content and code: `ResultCache`, `CachedDetector`, `code_digest`."""

@@ -1,8 +1,8 @@
 """A detector that remembers: flights of one comparison look at the same pixels again and again.
 
-What a detection cost is remembered with it, so that a flight can still say what it would have spent. An answer is
-named by all that decides it: the content of the model file, what runs it, the code and the versions of the libraries
-on the way, and the pixels. One that was cut off or changed is asked for again.
+The cost of a detection is remembered with it, so that a flight can still state its full cost. An answer is named by
+all that decides it: the content of the model file, its provider, the code and the versions of the libraries on the
+way, and the pixels. One that was cut off or changed is asked for again.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class CachedDetector(OnnxDetector):
         self._name = " ".join(said).encode()
         self._folder = make_folder(folder)
         self.saved_cpu_s = 0.0
-        """What the answers out of memory would have cost, less what it took to remember."""
+        """The cost of the answers out of memory, less that of remembering."""
 
     def detect(self, image_bgr: Image) -> Detections:
         began_s = time.process_time()
@@ -80,7 +80,7 @@ class CachedDetector(OnnxDetector):
 
 
 def _read(path: Path) -> tuple[Detections, float] | None:
-    """What lies there; None where there is nothing, or nothing whole."""
+    """The answer there; None where there is none, or no whole one."""
     body = read_whole(path)
     if body is None:
         return None

@@ -1,7 +1,7 @@
-"""What is never worked out twice, whole or not at all: small files, named by the content that decides them.
+"""Results that are never computed twice, whole or not at all: small files, named by the content that decides them.
 
 Each carries a checksum of its own. One that was cut off or changed is thrown away with a warning and made again.
-HVT's own code goes by its content: a version that stays the same through a hundred edits does not say what was run.
+HVT's own code counts by its content: a version that stays the same through a hundred edits does not identify it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from hvt_common.errors import UserError
 
 DETECTING = ("hvt_common", "hvt_models")
-"""Has a say in what a detector finds."""
+"""Packages that decide a detector's results."""
 FLYING = (*DETECTING, "hvt_codecs", "hvt_edge", "hvt_ground", "hvt_scene", "hvt_study")
 """Has one in a flight and its figures."""
 _BESIDE = ("hvt_study/commands", "hvt_study/report")
@@ -31,7 +31,7 @@ _DIGITS = 16
 
 
 def flight_code() -> str:
-    """Of all that decides a flight and its figures: what flies, with the extras that have a say, and the study."""
+    """Of all code that decides a flight and its figures: edge and ground, the extras that matter, and the study."""
     return code_digest(*FLYING, without=_BESIDE)
 
 
@@ -88,7 +88,7 @@ FLIGHTS = "flights"
 
 
 class CacheError(UserError):
-    """What was worked out cannot be kept (the disk is full): that is no fault of one run, and ends the study."""
+    """A result cannot be kept (the disk is full): that is no fault of one run, and ends the study."""
 
 
 def content_key(*parts: object) -> str:
@@ -123,7 +123,7 @@ def check_cache(folder: Path) -> None:
 
 
 def read_whole(path: Path) -> bytes | None:
-    """What `write_whole` put there; None where there is nothing, or nothing whole."""
+    """The bytes of `write_whole` there; None where there are none, or no whole ones."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -165,7 +165,7 @@ class ResultCache:
         self._folder = make_folder(folder)
 
     def get(self, key: str) -> dict[str, Any] | None:
-        """What was put under this key; None where there is nothing, or nothing whole."""
+        """The value under this key; None where there is none, or no whole one."""
         body = read_whole(self._path(key))
         found: dict[str, Any] | None = None if body is None else json.loads(body)
         return found
@@ -174,7 +174,7 @@ class ResultCache:
         write_whole(self._path(key), json.dumps(result, separators=(",", ":")).encode())
 
     def known(self, key: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-        """What was put under this key; else it is made, and put there."""
+        """The value under this key; else it is made, and put there."""
         found: Mapping[str, Any] | None = self.get(key)
         if found is None:
             found = make()

@@ -1,4 +1,4 @@
-"""The arguments that ``run``, ``plan`` and ``tune`` share, and what they ask for."""
+"""The arguments that ``run``, ``plan`` and ``tune`` share, and the plan that they make."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
 
 
 def parse_rates(text: str) -> tuple[int, ...]:
-    """``150,300`` kbps as bits a second, rising, each once; `UserError` for what is no such rate."""
+    """``150,300`` kbps as bits a second, rising, each once; `UserError` for text that is no such rate."""
     rates: set[int] = set()
     for word in text.split(","):
         try:
@@ -227,7 +227,7 @@ def open_sequences(arguments: argparse.Namespace) -> tuple[tuple[str, Sequence],
 
 
 def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequence]]) -> StudyPlan:
-    """What the arguments ask for, with these of `open_sequences`; `UserError` for what cannot be."""
+    """The plan of the arguments, with the sequences of `open_sequences`; `UserError` for an impossible one."""
     size = base_size(arguments.size)
     frames = flown_frames(getattr(arguments, "max_frames", None))
     cache: Path = getattr(arguments, "out", Path()) / "cache"  # who plans writes nothing

@@ -121,7 +121,7 @@ def print_result(result: CompareResult) -> None:
 
 
 def print_verdicts(found: Sequence[Verdict]) -> None:
-    """What to fly at each rate, and how."""
+    """Print the best method at each rate, and its settings."""
     for one in found:
         print_lines(f"\n{one.sentence}", *([f"fly this: {one.command}"] if one.command else []))
 
@@ -184,7 +184,7 @@ SIMPLEST_FIRST: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "M6": ("--profile", "thin"),
     }
 )
-"""Names of `COMPARED`, from the one with the fewest parts on, with what ``hvt-edge`` calls them."""
+"""Names of `COMPARED`, from the one with the fewest parts on, with the names of ``hvt-edge``."""
 _STALE_MS = 500
 
 

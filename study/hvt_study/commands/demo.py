@@ -1,4 +1,4 @@
-"""``hvt-study demo``: what each of several flights of the drawn scene knew, and what could be read of it."""
+"""``hvt-study demo``: compares several flights of the drawn scene by their tracks and by the readable codes."""
 
 from __future__ import annotations
 

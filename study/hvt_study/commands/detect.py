@@ -101,7 +101,7 @@ _Word = Callable[[str], str]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Pictures, the detector, and what their labels leave out."""
+    """Pictures, the detector, and the classes that labels leave out."""
     parser.add_argument(
         "pictures",
         nargs="+",
@@ -198,7 +198,7 @@ def _detect(arguments: argparse.Namespace) -> int:
 def readable(
     pictures: Sequence[LabelledPicture], what: str
 ) -> Iterator[tuple[LabelledPicture, Image, FrameLabels | None]]:
-    """Those that can be read, with their labels; the others, and what is wrong with labels, are said on stderr."""
+    """Readable pictures with their labels; the others, and faults of labels, are named on stderr."""
     skipped = 0
     with RunProgress(what) as progress:
         for number, picture in enumerate(pictures, start=1):
@@ -216,7 +216,7 @@ def readable(
 
 
 def detected(detector: Detector, image: Image, size: tuple[int, int]) -> FrameView:
-    """What the detector says of a picture that is fitted into ``size``, in the picture's pixels."""
+    """The detector's boxes of a picture that is fitted into ``size``, in the picture's pixels."""
     source_size = (image.shape[1], image.shape[0])
     base = Resizer(source_size, size, fit="letterbox").frame(image, index=0, capture_ns=0).base_bgr
     found: Detections = detector.detect(base)
@@ -236,7 +236,7 @@ def _rows(path: Path, view: FrameView, confidence: float) -> list[tuple[Any, ...
 
 
 def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word: _Word) -> tuple[str, ...]:
-    """The words that count: what ``--labelled`` names, else every class that the labels may use."""
+    """The words that count: those of ``--labelled``, else every class that the labels may use."""
     known = sorted({name for picture in pictures for name in picture.class_names})
     names = labelled or known
     if labelled and _VEHICLE in labelled:

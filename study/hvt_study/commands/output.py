@@ -1,4 +1,4 @@
-"""What commands print, also while they work, and what they write into ``--out``."""
+"""The output of commands: on the terminal, also while they work, and in ``--out``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hvt_common.runtime.reporting import check_writable
 _WIDTH = 100
 _LINE_EVERY_S = 60
 _FIRST_LINE_S = 1.0
-"""What cannot be done at all says so sooner."""
+"""An impossible command fails sooner."""
 _SOON_S = 45.0
 """Nearer to the end seconds are not told: the last runs, which end as they will, are all of it."""
 _REMEMBERED = 64
@@ -66,7 +66,7 @@ def decimals(value: float | None, digits: int = 3) -> str:
 
 
 def share(value: float | None, digits: int = 3) -> str:
-    """The same of what is from 0 to 1, without its 0."""
+    """The same of a number from 0 to 1, without its 0."""
     return decimals(value, digits).replace("0.", ".", 1)
 
 
@@ -82,7 +82,7 @@ def make_out(folder: Path, *, name: str) -> Path:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Within it, what cannot be written is a `UserError` that names ``--out``."""
+    """Within it, a failed write is a `UserError` that names ``--out``."""
     try:
         yield
     except (OSError, FlightError) as error:
@@ -94,7 +94,7 @@ def writing(folder: Path) -> Iterator[None]:
 class RunProgress:
     """How far ``what``, such as runs, is; the time left is told by how fast the last ones were done.
 
-    A bar on a terminal. Elsewhere a line at once, also while what is measured is still opened, one with the first
+    A bar on a terminal. Elsewhere a line at once, also while inputs are still opened, one with the first
     estimate, and one a minute.
     """
 
@@ -105,7 +105,7 @@ class RunProgress:
         self._began_s = self._said_s = time.monotonic()
         self._said = self._estimated = False
         self._steps: deque[tuple[float, int]] = deque([(self._began_s, 0)], maxlen=_REMEMBERED)
-        """(time, done); the first is that of the first one done: what begins a study is done once."""
+        """(time, done); the first is that of the first one done: the start of a study happens once."""
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),

@@ -29,7 +29,7 @@ _TRIAL_FRAMES = 30
 _USUAL_WEIGHTS = 2.2
 """Times that video is coded without a ground until its total is right; measured on drone_carpark and the demo."""
 _WEIGHT_SHARE = 0.5
-"""What one of them takes of a flight."""
+"""The share of one of them in a flight."""
 _ROW_BYTES = 9_000
 _DETECTION_BYTES = 4_096
 """One file, of a block."""
@@ -56,7 +56,7 @@ class Estimate:
 
 
 def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, frame_s: float) -> Estimate:
-    """Count what `hvt_study.matrix.plan.run_all` would do; ``frame_s`` is what a flight takes for a frame."""
+    """Count what `hvt_study.matrix.plan.run_all` would do; ``frame_s`` is the time of a flight for a frame."""
     frames = sum(one.limited(plan.max_frames).clip_frames for one in sequences)
     video = [method for method in plan.methods if method.kind is Kind.VIDEO]
     first = list(first_runs(replace(plan, sequences=plan.sequences[:1])))  # of each sequence
@@ -79,7 +79,7 @@ def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, frame_s: float
 
 
 def time_of_a_frame(plan: StudyPlan) -> float:
-    """Fly the first hybrid of the plan (or the first method) for two seconds, and return what a frame took.
+    """Fly the first hybrid of the plan (or the first method) for two seconds, and return the time of a frame.
 
     Raises `UserError` where the first sequence or a model cannot be used, or the edge does not take the settings.
     """
@@ -87,7 +87,7 @@ def time_of_a_frame(plan: StudyPlan) -> float:
     spec = next((one for one in specs if METHODS[one.method].kind is Kind.HYBRID), specs[0])
     spec = replace(spec, max_frames=_TRIAL_FRAMES)
     with TemporaryDirectory(prefix="hvt-study-") as folder:
-        context = open_run_context(spec, cache=Path(folder))  # what is done once for all runs over a sequence
+        context = open_run_context(spec, cache=Path(folder))  # is done once for all runs over a sequence
         began_s = time.monotonic()
         row = run_spec(spec, cache=Path(folder))
         took_s = time.monotonic() - began_s
@@ -145,7 +145,7 @@ def _lines(found: Estimate, *, frame_s: float, jobs: tuple[int, ...]) -> list[tu
 
 
 def hours_in_words(hours: float) -> str:
-    """What is short in a unit in which it is a number: 0.0 hours say nothing."""
+    """A short time in a smaller unit: 0.0 hours say nothing."""
     if hours >= 1:
         return f"{hours:.1f}"
     seconds = 3600 * hours

@@ -198,7 +198,7 @@ def _cell(crop: Image | None, title: str, text: str, colour: tuple[int, int, int
         left, top = (wide - size[0]) // 2, (high - size[1]) // 2
         cell[top : top + size[1], left : left + size[0]] = small
     _write(cell, title, (8, high - 22), colour, scale=0.8)
-    # The reader may say what this font has no signs for.
+    # The reader may find signs that this font lacks.
     _write(cell, text.encode("ascii", "replace").decode(), (8, high + 12), colour, scale=0.42)
     return cell
 

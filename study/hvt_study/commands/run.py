@@ -28,7 +28,7 @@ from hvt_study.runs.execute import runner
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What to compare, and where it is done and written."""
+    """The plan to compare, and where it is done and written."""
     add_plan_arguments(parser)
     option(parser, "--accounting", default="span")
     add_pool_arguments(parser)
@@ -38,10 +38,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run all, and write the table and the report; the table also where something ends the study.
 
     Rows of an earlier table in ``--out`` stay, behind those of this study: of methods, budgets, sequences or
-    conditions that this study does not have, and of runs that it was not given the time to do. What it did itself
-    takes the place of what was there. A table that cannot be read (an older version wrote it) is set aside. Raises
-    `UserError` where what was asked for cannot be done, an earlier table has the same methods with other parameters,
-    or every run failed.
+    conditions that this study does not have, and of runs that it was not given the time to do. Its own
+    rows replace those that were there. A table that cannot be read (an older version wrote it) is set aside. Raises
+    `UserError` where the plan is impossible, an earlier table has the same methods with other parameters, or every
+    run failed.
     """
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     plan = study_plan(arguments, open_sequences(arguments))
@@ -76,7 +76,7 @@ def _earlier(table: Path) -> list[RunRow]:
 
 
 def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> int:
-    """Write them, and behind them what stays of the table as it is by now; returns how many those are."""
+    """Write them, and behind them the remaining rows of the present table; returns the number of those."""
     others = staying(rows, _earlier(table))
     write_results(in_accounting([*rows, *others], arguments.accounting), table)
     return len(others)
@@ -98,7 +98,7 @@ def _flown(plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> list[
             return run_all(plan, pool=workers, run=runner(plan.cache), at_once=at_once, on_row=on_row)
     except BaseException:
         if done:
-            with suppress(UserError):  # what ended the study is what is said
+            with suppress(UserError):  # the error that ended the study is reported
                 others = _write(in_order(plan, done), arguments, table)
                 beside = f", and {others} of before" if others else ""
                 progress.note(

@@ -31,7 +31,7 @@ _INPUT_COLUMNS = ("frame", "x1", "y1", "x2", "y2", "conf", "class")
 
 @dataclass(frozen=True, slots=True)
 class RawDetections:
-    """What a detector said of one frame, in its order."""
+    """A detector's boxes of one frame, in its order."""
 
     boxes_xyxy_px: npt.NDArray[Any]
     """(N, 4) float32 of a detector, float64 of a table: the limits of sides and areas are met to the last ROI."""
@@ -183,7 +183,7 @@ def _from_clip(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections],
 
 
 def _refuse(arguments: argparse.Namespace, names: Sequence[str], what: str) -> None:
-    """What would have no effect is a misunderstanding."""
+    """An option without effect is a misunderstanding."""
     for name in names:
         if hasattr(arguments, name):
             flag = "--" + name.replace("_", "-")

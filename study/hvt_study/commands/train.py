@@ -158,7 +158,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _checked(arguments: argparse.Namespace) -> tuple[_Size, Path]:
-    """Size and start; `UserError` for what cannot be, before an hour is spent."""
+    """Size and start; `UserError` for impossible ones, before an hour is spent."""
     size = parse_size(arguments.size, name="--size")
     for name, value, most in (
         ("--minutes", arguments.minutes, 10_000),
@@ -215,7 +215,7 @@ def _classes(pictures: Sequence[LabelledPicture]) -> list[str]:
 
 
 def _read(pictures: Sequence[LabelledPicture]) -> list[_Own]:
-    """Every picture and label once, so that what is wrong is said at the start."""
+    """Every picture and label once, so that faults are named at the start."""
     read = []
     for picture, _, labels in readable(pictures, "pictures read"):
         assert labels is not None, "only labelled ones are here"
@@ -224,7 +224,7 @@ def _read(pictures: Sequence[LabelledPicture]) -> list[_Own]:
 
 
 def _split(data: Sequence[list[_Own]], apart: Sequence[list[_Own]]) -> tuple[list[_Own], list[_Own]]:
-    """What is trained on, and what is held out: the last fifth of each, for neighbours of a clip are alike.
+    """Training and held-out pictures: the last fifth of each set is held out, for neighbours of a clip are alike.
 
     A picture that is in both is held out.
     """

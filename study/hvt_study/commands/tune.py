@@ -63,7 +63,7 @@ def split(
 ) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """(training, held out), by a hash of the name: the same sequences in every run, whatever else is in the set.
 
-    ``pictures`` names those that several sequences are flown over: what one side has seen the other does not get.
+    ``pictures`` names those that several sequences are flown over: a picture of one side does not go to the other.
     Raises `UserError` where there are not two names, or the share leaves one side empty.
     """
     names = [pictures.get(one, one[1]) for one in sequences]
@@ -93,10 +93,10 @@ def tune(
     seed: int = 0,
     on_trial: Callable[[int, float, float], None] = lambda *_: None,
 ) -> dict[str, Any]:
-    """Search, and return what ``tune.json`` holds; ``on_trial(number, worth, best)`` is called after each.
+    """Search, and return the content of ``tune.json``; ``on_trial(number, worth, best)`` is called after each.
 
-    Of all that is found ``held_out_gain`` alone, the mean gain on what the search has not seen, says whether it is
-    any better. Raises `UserError` where the method cannot be flown with its defaults.
+    Only ``held_out_gain``, the mean gain on sequences that the search has not seen, tells whether the result is
+    better. Raises `UserError` where the method cannot be flown with its defaults.
     """
 
     def mean_worth(texts: tuple[str, ...]) -> float:
@@ -104,7 +104,7 @@ def tune(
         return sum(map(_worth, rows)) / len(rows)
 
     default = mean_worth(())
-    as_it_is = _flown(plan, method, pool, held_out, ())  # what cannot be flown is told before the search
+    as_it_is = _flown(plan, method, pool, held_out, ())  # an impossible flight fails before the search
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     search = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
     search.add_trial(_known(parameters, default))
@@ -164,7 +164,7 @@ def _flown(
 
 
 def _known(parameters: Mapping[str, float], worth: float) -> optuna.trial.FrozenTrial:
-    """What the defaults are worth, which is known before the first proposal."""
+    """The worth of the defaults, which is known before the first proposal."""
     ranges: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(*_range(default), log=True)
         for name, default in parameters.items()
@@ -184,7 +184,7 @@ def _range(default: float) -> tuple[float, float]:
 
 
 def _rounded(value: float) -> float:
-    """Three digits: what can be typed, and is what was flown."""
+    """Three digits, which can be typed and are flown."""
     return float(f"{value:.3g}")
 
 

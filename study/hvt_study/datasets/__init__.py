@@ -1,1 +1,1 @@
-"""What a dataset is: `Sequence`, `Clip`, `FrameLabels`, `ClassMap`, `reference_labels`; `layouts` opens them."""
+"""The parts of a dataset: `Sequence`, `Clip`, `FrameLabels`, `ClassMap`, `reference_labels`; `layouts` opens them."""

@@ -1,6 +1,6 @@
-"""Annotations and detections as lines of numbers between commas. What is wrong is said with the file and the line.
+"""Annotations and detections as lines of numbers between commas. Faults are named with the file and the line.
 
-A line that is wrong costs a dataset itself and no more; of results that are to be judged it ends the reading.
+A wrong line of a dataset is left out; in results that are to be judged it ends the reading.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Rows:
         return np.asarray(self.table[:, self.columns.index(column)])
 
     def only(self, good: npt.NDArray[np.bool_], *, accepted: str) -> Rows:
-        """The rows that are good. What is left out of a dataset is counted, and its first row named in the log.
+        """The rows that are good. Rows left out of a dataset are counted, and the first is named in the log.
 
         `UserError` names it where none is good, or these rows are of no dataset.
         """

@@ -17,7 +17,7 @@ from hvt_common.inference.labels import first_synonym
 
 _VEHICLE = "vehicle"
 _VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
-"""What a dataset means that calls all of them so."""
+"""The kinds behind the name where a dataset calls all of them so."""
 _SHOWN = 12
 
 
@@ -36,7 +36,7 @@ class ClassMap:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Words that both sides have, sorted: what metrics are of."""
+        """Words that both sides have, sorted: the classes of metrics."""
         return tuple(sorted(set(self.words.values())))
 
 
@@ -50,7 +50,7 @@ def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> C
         found, words_of = _pair(ours[kind], theirs[kind], kind=kind)
         spoken |= found
         words |= words_of
-    if MOVING in models and len(models) == 1:  # the motion detector does not say what it is that moves
+    if MOVING in models and len(models) == 1:  # the motion detector does not name moving objects
         spoken, words = {MOVING: classes}, dict.fromkeys((MOVING, *classes), MOVING)
     if not spoken or not classes:
         raise UserError(
@@ -70,7 +70,7 @@ def of_kinds(names: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
 def _pair(
     models: list[str], classes: list[str], *, kind: str
 ) -> tuple[dict[str, tuple[str, ...]], dict[str, str]]:
-    """Of one kind: what each model class speaks of, and the word of every name."""
+    """Of one kind: the dataset classes of each model class, and the word of every name."""
     if len(classes) > 1 and {_plain(name) for name in models} == {_plain(name) for name in classes}:
         named = {_plain(name): name for name in classes}
         spoken: dict[str, tuple[str, ...]] = {name: (named[_plain(name)],) for name in models}
@@ -102,8 +102,8 @@ def joint_classes(
 ) -> ClassMap:
     """One vocabulary for a detector, a classifier (None: the detector reads, or nobody) and the labels of a dataset.
 
-    Within one kind names stay apart only where both models have the very names of the dataset: what one of them
-    cannot tell apart is not asked of the other. A ``minivan`` of ImageNet is right on a ``car``, and on a ``van``.
+    Within one kind names stay apart only where both models have the very names of the dataset: names that one of them
+    cannot tell apart are one for the other too. A ``minivan`` of ImageNet is right on a ``car``, and on a ``van``.
     Raises `UserError` where one of them has no kind in common with the dataset.
     """
     found = map_classes(detector_names, class_set)

@@ -53,7 +53,7 @@ _DEPTH = 3
 
 
 class Folders:
-    """What lies in folders, whatever the case and the accents' form of its name: ``A.JPG`` has ``A.TXT`` too."""
+    """Files in folders, whatever the case and the accents' form of their names: ``A.JPG`` has ``A.TXT`` too."""
 
     def __init__(self) -> None:
         self._names: dict[Path, dict[str, str]] = {}
@@ -175,7 +175,7 @@ def keypoint_columns(path: Path | None) -> int:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    """A table whose words are all text; `UserError` where the file is no YAML. What is no table is an empty one."""
+    """A table whose words are all text; `UserError` where the file is no YAML. Anything but a table is empty."""
     import yaml  # noqa: PLC0415 - of the study alone; hvt-study sweep runs where only the edge is installed
 
     try:
@@ -187,7 +187,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _words(value: object) -> list[str]:
-    """Of a word, or of a list; what is neither is none."""
+    """Of a word or a list; none of anything else."""
     every = [value] if isinstance(value, str) else list(value) if isinstance(value, list | tuple) else []
     return [one for one in every if isinstance(one, str)]
 
@@ -314,8 +314,8 @@ def read_yolo(
 ) -> FrameLabels:
     """The labels of a picture of this (width, height), in its pixels: rows of boxes, or of polygons.
 
-    Behind the boxes there may be so many columns of ``keypoints``, which are no polygon. What ends outside the
-    picture is cut, and a row that cannot be is left out; ``doubts`` counts both.
+    Behind the boxes there may be so many columns of ``keypoints``, which are no polygon. Boxes that end outside the
+    picture are cut, and impossible rows are left out; ``doubts`` counts both.
     """
     rows = []
     doubts.classes = len(names)

@@ -95,7 +95,7 @@ class LabelTable:
         return int(max(ends, default=-1))
 
     def at(self, frame: int) -> FrameLabels:
-        """What is in a frame; objects mostly in unlabelled regions are left out."""
+        """The labels of a frame; objects mostly in unlabelled regions are left out."""
         begin, end = np.searchsorted(self.frames, [frame, frame + 1])
         first, last = np.searchsorted(self.ignored.frames, [frame, frame + 1])
         boxes, regions = self.boxes[begin:end], self.ignored.boxes[first:last]
@@ -161,18 +161,18 @@ _REGION, _OTHERS = 0, 11
 
 
 def image_labels(path: Path, size: tuple[int, int]) -> FrameLabels:
-    """Of one image of this (width, height); what is wrong is left out. `UserError` where all is."""
+    """Of one image of this (width, height); wrong rows are left out. `UserError` where all are."""
     table = _table(read_rows(path, columns=_OBJECT, least=6, frames=False, of_dataset=True), size)
     return table.at(-1)  # the value of a column that the file does not have
 
 
 def video_table(path: Path, size: tuple[int, int]) -> LabelTable:
-    """Of one sequence of pictures of this (width, height); what is wrong is left out. `UserError` where all is."""
+    """Of one sequence of pictures of this (width, height); wrong rows are left out. `UserError` where all are."""
     return _table(read_rows(path, columns=f"frame,id,{_OBJECT}", least=10, of_dataset=True), size)
 
 
 def _table(rows: Rows, size: tuple[int, int]) -> LabelTable:
-    """Objects that are asked for, and what is not: regions, and single objects ("others", and those of score 0)."""
+    """Wanted objects, and unwanted ones: regions, and single objects ("others", and those of score 0)."""
     column = rows.columns.index("category") + 1
     rows = rows.only(
         np.isin(rows["category"], np.arange(_OTHERS + 1)),

@@ -184,7 +184,7 @@ def _of_yaml(path: Path, classes: Sequence[str] | None) -> list[LabelledPicture]
 
 
 def doubts_of(pictures: Sequence[LabelledPicture]) -> list[str]:
-    """What was wrong with the labels that were read, in sentences; `UserError` where no label of a set was good."""
+    """The faults of the labels that were read, in sentences; `UserError` where no label of a set was good."""
     sets = {id(picture.doubts): picture.doubts for picture in pictures}.values()
     for doubts in sets:
         doubts.check()

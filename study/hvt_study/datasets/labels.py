@@ -1,4 +1,4 @@
-"""What is in one frame of a dataset, and which parts of it count."""
+"""The labels of one frame of a dataset, and which parts of it count."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class FrameLabels:
 
 @dataclass(slots=True)
 class LabelDoubts:
-    """What was wrong with the labels of a set, counted; the worst, or the first, is named."""
+    """The faults of the labels of a set, counted; the worst, or the first, is named."""
 
     good: int = 0
     kinds: set[float] = field(default_factory=set)
@@ -95,7 +95,7 @@ class LabelDoubts:
     ) -> FrameLabels:
         """Of (class, x1 y1 x2 y2, place in words), times ``scale``, in a picture of this (width, height).
 
-        Boxes are cut at the picture. What has no area inside, and what stands there twice, is left out; boxes of
+        Boxes are cut at the picture. Boxes without area inside, and repeated ones, are left out; boxes of
         `IGNORED` become regions.
         """
         names, boxes, wheres = zip(*rows, strict=True) if rows else ((), (), ())

@@ -1,8 +1,8 @@
-"""Reference labels: what a detector, and a classifier if wanted, say of the untouched source frames.
+"""Reference labels: the answers of a detector, and of a classifier if wanted, on the untouched source frames.
 
-The protocol of DDS, AccMPEG and Reducto: such labels say how much of what the model *could* have seen survives the
-link, not that the model was right. A detector in tiles (`hvt_common.inference.tiles`) sees the source as finely as
-the edge may. Answers are remembered by the pixels that were asked about (`CachedDetector`), so that a run that was
+The protocol of DDS, AccMPEG and Reducto: such labels tell how many objects that the model *could* have seen survive
+the link, not that the model was right. A detector in tiles (`hvt_common.inference.tiles`) sees the source as finely
+as the edge may. Answers are remembered by the pixels that were asked about (`CachedDetector`), so that a run that was
 killed does not ask twice.
 """
 

@@ -1,4 +1,4 @@
-"""What a dataset is made of: sequences with labels by source frame, and the clips that flights play.
+"""The parts of a dataset: sequences with labels by source frame, and the clips that flights play.
 
 A clip is small, and it can be sent to another process: the pictures are read when they are played, one at a time,
 from the source or from a file of raw pixels that processes share (`stage_clip`).
@@ -36,7 +36,7 @@ class Clip:
     """Pictures at `NOMINAL_FPS`, in a file that processes share, or read again from a large source."""
 
     spec: str
-    """What ``--source`` takes, if it ends by itself: a video, a folder of images, ``demo``; or ``still:PICTURE``."""
+    """A value of ``--source`` that ends by itself: a video, a folder of images, ``demo``; or ``still:PICTURE``."""
     source_size: tuple[int, int]
     """(width, height) in pixels."""
     frame_count: int
@@ -53,7 +53,7 @@ class Clip:
             yield from self._read()
             return
         wide, high = self.source_size
-        with self.pixels.open("rb") as file:  # not mapped: what is resident would grow with the clip
+        with self.pixels.open("rb") as file:  # not mapped: resident memory would grow with the clip
             for _ in range(self.frame_count):
                 image = np.empty((high, wide, 3), np.uint8)
                 if file.readinto(image.data.cast("B")) < image.nbytes:
@@ -115,7 +115,7 @@ def stage_clip(clip: Clip, path: Path) -> Clip:
 
 
 def staged_bytes(clip: Clip) -> int:
-    """What `stage_clip` takes of its folder, if there is room; 0 where it leaves the clip as it is."""
+    """The bytes that `stage_clip` takes of its folder, if there is room; 0 where it leaves the clip as it is."""
     wide, high = clip.source_size
     size_bytes = clip.frame_count * wide * high * 3
     return 0 if clip.pixels is not None or size_bytes > _MOST_SHARED_BYTES else size_bytes
@@ -130,14 +130,14 @@ class Sequence:
     dataset: str
     """Scheme of its URI: ``visdrone``, ``uavdt``, ``mot``, ``clips``, ``demo`` or ``still``."""
     clip: Clip
-    """What the flight plays, ``clip.frame_count`` frames at 15 a second."""
+    """The clip of a flight, ``clip.frame_count`` frames at 15 a second."""
     frame_count: int
     """Source frames of the whole sequence, of which `limited` takes nothing away."""
     fps: float
     source_size: tuple[int, int]
     """(width, height) in pixels."""
     labels: Callable[[int], FrameLabels] | None
-    """By source frame, 0 … ``frame_count`` - 1; None where nobody has said what is there."""
+    """By source frame, 0 … ``frame_count`` - 1; None where nobody has labelled it."""
     class_set: tuple[str, ...]
     """Classes that the annotations may use, sorted: the same for all sequences of a dataset, whether each has them or
     not, so that names are compared alike in all of them."""
@@ -145,7 +145,7 @@ class Sequence:
     """One object is labelled and nothing else that is in view: it is found or missed, and no box is known to be
     wrong."""
     attributes: Mapping[str, str] = field(default_factory=dict)
-    """What else is known, such as ``weather: fog``."""
+    """Further facts, such as ``weather: fog``."""
     files: tuple[Path, ...] = ()
     """Everything that its pictures and labels are made from: files, and folders of images."""
     codes: Callable[[int], tuple[CodeInView, ...]] | None = None
@@ -170,7 +170,7 @@ class Sequence:
         return min(shown_frame(frame_index, fps=self.fps), self.frame_count - 1)
 
     def labels_at(self, frame_index: int) -> FrameLabels | None:
-        """What is in a frame of the clip; None without labels."""
+        """The labels of a frame of the clip; None without labels."""
         return None if self.labels is None else self.labels(self.source_frame(frame_index))
 
     def limited(self, frames: int | None) -> Sequence:

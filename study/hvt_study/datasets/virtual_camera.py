@@ -101,10 +101,10 @@ def annotation_file(picture: Path) -> Path:
 def read_annotations(
     path: Path, size: tuple[int, int], *, classes: Sequence[str] = ()
 ) -> tuple[FrameLabels, tuple[str, ...]]:
-    """What `annotation_file` names, in a picture of this (width, height), and all classes that it may use, sorted.
+    """The labels of `annotation_file`, in a picture of this (width, height), and all classes that it may use, sorted.
 
-    ``classes`` are names of YOLO's; none: those of ``classes.txt`` beside its folder. What is wrong is left out;
-    `UserError` where all is.
+    ``classes`` are names of YOLO's; none: those of ``classes.txt`` beside its folder. Wrong rows are left out;
+    `UserError` where all are.
     """
     if path.parent.name != _YOLO:
         return image_labels(path, size), tuple(sorted(VISDRONE_NAMES))
@@ -126,7 +126,7 @@ class VirtualCamera:
 
     picture_path: Path
     view_heights: float = USUAL_VIEW
-    """Height of what it sees at its lowest, in heights of the picture; beyond about 0.9 mirrored land is in view."""
+    """Height of its view at its lowest, in heights of the picture; beyond about 0.9 mirrored land is in view."""
     fps: float = 15.0
     seed: int = 0
     annotated: bool = True
@@ -190,7 +190,7 @@ class VirtualCamera:
         return np.clip(noise.round(), -127, 127).astype(np.int8)
 
     def labels(self, index: int) -> FrameLabels | None:
-        """What is in a frame, in its pixels, clipped to it; None without annotations.
+        """The labels of a frame, in its pixels, clipped to it; None without annotations.
 
         Each mirror image of an object is one of its own, and keeps its id. Objects of which less than 0.6 is inside
         the frame are not judged.

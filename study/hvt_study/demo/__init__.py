@@ -1,4 +1,4 @@
-"""Flights of the drawn scene that edges and a ground left in a folder, side by side: what each knew and showed.
+"""Flights of the drawn scene that edges and a ground left in a folder, side by side: their tracks and pictures.
 
 `Compared`, `compare_flown`, `write_picture`.
 """

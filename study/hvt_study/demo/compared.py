@@ -1,4 +1,4 @@
-"""Flights over the drawn scene, compared: each against the scene's exact truth, and by what can be read of it."""
+"""Flights over the drawn scene, compared with the scene's exact truth, and by the codes read in them."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class Flown:
 
 
 def read_flown(folder: Path, name: str) -> Flown:
-    """The flight of the edge ``name`` from what hvt-edge and hvt-ground wrote into ``folder``.
+    """The flight of the edge ``name`` from the files of hvt-edge and hvt-ground in ``folder``.
 
-    Raises `UserError` where a file is missing or is not what it should be.
+    Raises `UserError` where a file is missing or of another kind.
     """
     summary = _only(folder, f"{name}-edge.json")
     try:
@@ -167,7 +167,7 @@ def stills_with_codes(
 
 
 def code_pictures(shown: Shown, base: Image) -> tuple[Image, Image]:
-    """The same roof for the eye: of a base picture, and of the still; each enlarged from what it is."""
+    """The same roof for the eye: of a base picture, and of the still; each enlarged."""
     x1, y1, x2, y2 = shown.box_base_px
     reach = _CONTEXT * max(x2 - x1, y2 - y1) / 2
     x, y = (x1 + x2) / 2, (y1 + y2) / 2
@@ -235,7 +235,7 @@ class Compared:
         ]
 
     def pairs(self) -> list[Pair]:
-        """Roofs in the first flight's video and in stills of the last: what only these show first, then by size."""
+        """Roofs in the first flight's video and in stills of the last: those only in stills first, then by size."""
         video, last = self.flown[0], self.flown[-1]
         known = frozenset() if self.legible is None else self.legible[0].every
         if self.legible is not None and self.legible[-1].stills:
@@ -259,7 +259,7 @@ class Compared:
 
 
 def compare_flown(folder: Path, names: Sequence[str], *, seed: int, with_reader: bool) -> Compared:
-    """Compare what edges of these names left in ``folder``; see `hvt_study.demo.compared.read_flown`."""
+    """Compare the flights of edges of these names in ``folder``; see `hvt_study.demo.compared.read_flown`."""
     flown = tuple(read_flown(folder, name) for name in names)
     (scene,) = open_dataset(f"demo:{seed},codes")
     assert scene.labels is not None, "a drawn scene says what is in it"

@@ -1,4 +1,4 @@
-"""One picture of several flights: the same place and instant as each shows it, and what stills add to the video."""
+"""One picture of several flights: the same place and instant in each, and the gain of stills."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LEVELS = 16
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """What one flight shows at an instant."""
+    """The picture of one flight at an instant."""
 
     title: str
     picture: Image
@@ -48,7 +48,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """A roof in the video and in a still, and what was read of it."""
+    """A roof in the video and in a still, and the code read there."""
 
     video: Image
     still: Image
@@ -127,7 +127,7 @@ def _pair(one: Pair) -> Image:
         large = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
         cell[: size[1], left : left + size[0]] = _coarse(np.asarray(large, np.uint8))
         words = _blank(_PAIR_PX[0], _TEXT_PX)
-        # The reader may say what this font has no signs for.
+        # The reader may find signs that this font lacks.
         _write(words, text.encode("ascii", "replace").decode(), (4, 20), _INK, scale=0.5)
         cells.append(np.vstack((cell, words)))
     return _beside(cells)

@@ -2,8 +2,8 @@
 
 The edge is `hvt_edge.app.Edge` in another world: where frames come from (`FrameSource`), where messages go
 (`SerialLink`), and when feedback comes back. The ground is `Session`. Media time is the only
-time: a message acts at the ground when the link has delivered it and not before, and what the ground says of a still
-is heard at the edge as much later as that still took to cross. The same input gives the same flight, always.
+time: a message acts at the ground when the link has delivered it and not before, and the answer to a still comes
+back to the edge as much later as that still took to cross. The same input gives the same flight, always.
 
 The ground's list is taken at every frame of the clip (15 a second), coded or not. At a frame that was not coded it is
 taken as late after its capture as the last picture was.
@@ -67,7 +67,7 @@ class FlightPlan:
 
 @dataclass(frozen=True, slots=True)
 class FlightReport:
-    """What a flight cost and what it showed."""
+    """The cost of a flight, and its lists."""
 
     lists: tuple[ObservedFrame, ...]
     """The ground's list at every frame, source pixels."""
@@ -134,7 +134,7 @@ def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport
 def dry_run(plan: FlightPlan, *, detector: Detector) -> float:
     """Fly without a ground; return the line bits a second, headers and transport included.
 
-    Where nothing that a ground says matters (methods without stills), that is to the bit what `fly` spends. Raises
+    Where no answer of a ground matters (methods without stills), `fly` spends the same to the bit. Raises
     `UserError` where the edge refuses its settings.
     """
     flight = Flight(plan, detector=detector, make_ground=lambda _info, link: _NoGround(link))
@@ -143,7 +143,7 @@ def dry_run(plan: FlightPlan, *, detector: Detector) -> float:
 
 
 class _SteppedSource(FrameSource):
-    """A clip with the ground in step: after each frame, what has arrived by then is taken in."""
+    """A clip with the ground in step: after each frame, arrived messages are taken in."""
 
     def __init__(self, flight: Flight, resizer: Resizer, *, frames: frozenset[int]) -> None:
         super().__init__(flight.plan.clip, resizer, frames=frames)
@@ -179,7 +179,7 @@ class _FlightWorld(World):
 
     def open_source(self, config: EdgeConfig) -> FrameSource:
         clip = self._flight.plan.clip
-        # With --fps auto the edge sees every frame, and leaves out by itself what it does not code.
+        # With --fps auto the edge sees every frame, and leaves out frames by itself.
         fps = NOMINAL_FPS if isinstance(config.fps, str) else config.fps
         resizer = Resizer(clip.source_size, base_size(config), fit=cast("Fit", config.fit))
         return _SteppedSource(self._flight, resizer, frames=coded_frames(clip.frame_count, fps))
@@ -189,7 +189,7 @@ class _FlightWorld(World):
 
 
 class Flight:
-    """The edge's own app over a clip and a simulated link; ``make_ground`` makes what is at its other end."""
+    """The edge's own app over a clip and a simulated link; ``make_ground`` makes its other end."""
 
     def __init__(
         self,
@@ -243,7 +243,7 @@ class Flight:
         return time.process_time()
 
     def after_frame(self, frame: Frame, *, began_s: float) -> None:
-        """The edge has done with this frame: the ground takes in what has arrived."""
+        """The edge has done with this frame: the ground takes in arrived messages."""
         self._cpu_s += time.process_time() - began_s
         self._pass_over(frame.index)
         if self.outlet.last_frame != frame.index:
@@ -267,7 +267,7 @@ class Flight:
 
 
 class _NoGround:
-    """A ground that takes what comes and analyzes nothing."""
+    """A ground that takes all messages and analyzes nothing."""
 
     def __init__(self, link: SerialLink[Received]) -> None:
         self._link = link

@@ -1,4 +1,4 @@
-"""The ground's end of a flight: takes what the link delivers, when it does, and keeps the list of every frame."""
+"""The ground's end of a flight: takes messages when the link delivers them, and keeps the list of every frame."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _T = TypeVar("_T")
 
 
 class InlineExecutor(ThreadPoolExecutor):
-    """Does everything at once in the thread that asks: what is done side by side in flight comes one by one here."""
+    """Does everything at once in the thread that asks: work that is parallel in flight comes one by one here."""
 
     def __init__(self) -> None:
         super().__init__(1)
@@ -104,7 +104,7 @@ class _Worker(LockstepWorker):
 
 
 class GroundSide:
-    """Takes what arrives over ``link`` as time goes on; keeps the list of every frame, in source pixels.
+    """Takes messages of ``link`` as time goes on; keeps the list of every frame, in source pixels.
 
     ``info`` is the edge's, with the rate of frames as its frame rate.
     """
@@ -143,7 +143,7 @@ class GroundSide:
         self._uncoded: deque[tuple[int, int]] = deque()
         self.lists: dict[int, ObservedFrame] = {}
         self.results: deque[tuple[int, StillResult]] = deque()
-        """What the edge is to hear, with the time at which it does."""
+        """Answers to the edge, with the time at which it hears them."""
         self.detected: deque[tuple[int, Detected]] = deque()
         self.back_bytes = 0
         """Line bytes of the reports that say something of stills; the way back is not the budget's."""
@@ -158,7 +158,7 @@ class GroundSide:
         self._uncoded.append((frame_index, capture_ns))
 
     def advance(self, now_ns: int | None) -> None:
-        """Take in what has arrived by now; None: all there is, to the end."""
+        """Take in messages that have arrived by now; None: all, to the end."""
         for arrival in self._link.arrived(now_ns):
             self._take_uncoded(until_ns=arrival.arrival_ns)
             self.now_ns = arrival.arrival_ns
@@ -171,7 +171,7 @@ class GroundSide:
         self._take_uncoded(until_ns=now_ns)
 
     def close(self) -> None:
-        """Take in what is left and end the session."""
+        """Take in the rest and end the session."""
         self.advance(None)
         self._session.close()
         if self.lists:
@@ -183,7 +183,7 @@ class GroundSide:
         return self._worker
 
     def _receive(self, arrival: Arrival[Received]) -> None:
-        """As `hvt_ground.link.receiver` hands on what is whole and in order."""
+        """As `hvt_ground.link.receiver` hands on whole messages in order."""
         item = arrival.message
         row = (parse_key(item.key) or ("", None))[1]
         if row is Channel.BASE:
@@ -202,7 +202,7 @@ class GroundSide:
             self._session.take(Status.parse(item.payload), item)
 
     def _answer(self, last: Arrival[Received]) -> None:
-        """What the ground has to say goes back in the time that the newest message took to come."""
+        """The answers of the ground go back in the time that the newest message took to come."""
         back_ns = self.now_ns + (last.arrival_ns - last.enter_ns)
         results = self._session.reception.take_results(_MOST_RESULTS)
         self._record.answers(results)
@@ -269,7 +269,7 @@ class GroundSide:
             self._take_list(frame_index, at_ns=at_ns)
 
     def _take_list(self, frame_index: int, *, at_ns: int) -> None:
-        """What an operator is shown at a frame of which no picture comes."""
+        """The list that an operator sees at a frame of which no picture comes."""
         if self._decoded:
             self._note(self._session.pipeline.list_at(frame_index))
         self._put_down(frame_index, at_ns=at_ns)

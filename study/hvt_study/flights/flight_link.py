@@ -91,7 +91,7 @@ class SerialLink(Generic[_T]):
         self._count += 1
 
     def arrived(self, now_ns: int | None) -> list[Arrival[_T]]:
-        """What has arrived by ``now_ns`` and was not returned before, in order; None: all that is left.
+        """Messages that have arrived by ``now_ns`` and were not returned before, in order; None: all the rest.
 
         Everything that enters before ``now_ns`` has to be put before.
         """
@@ -116,7 +116,7 @@ class SerialLink(Generic[_T]):
 
 
 def _worst_queue(arrivals: Iterable[Arrival[_T]]) -> int:
-    """The highest sum of what has entered and not arrived; what arrives at an instant makes room at that instant."""
+    """The highest sum of bytes that have entered and not arrived; an arrival makes room at its instant."""
     steps: list[tuple[int, int]] = []
     for one in arrivals:
         steps += [(one.enter_ns, one.size_bytes), (one.arrival_ns, -one.size_bytes)]
@@ -136,7 +136,7 @@ def frame_ns(frame_index: int) -> int:
 
 
 class MediaClock(SteadyClock):
-    """Stands still: in lockstep the source alone says what time it is."""
+    """Stands still: in lockstep the source alone sets the time."""
 
     def __call__(self) -> int:
         """Unix nanoseconds of the flight's beginning."""
@@ -144,7 +144,7 @@ class MediaClock(SteadyClock):
 
 
 class FlightInbox(FeedbackInbox):
-    """What the ground said, when the link has brought it back; nobody ever waits for more."""
+    """The answers of the ground, when the link has brought them back; nobody ever waits for more."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -153,7 +153,7 @@ class FlightInbox(FeedbackInbox):
         self.due_detected: deque[tuple[int, Detected]] = deque()
 
     def take(self) -> list[StillResult]:
-        """Return and forget what has come by now."""
+        """Return and forget the answers that have come by now."""
         due = [one for at_ns, one in self.due if at_ns <= self.now_ns]
         self.due = deque((at_ns, one) for at_ns, one in self.due if at_ns > self.now_ns)
         return due
@@ -178,7 +178,7 @@ class FlightInbox(FeedbackInbox):
 class FlightOutlet:
     """The edge's end of the link: `hvt_edge.link.publisher.EdgeLink` without Zenoh.
 
-    ``on_listen(info)`` is called with what the edge answers to ``info`` once it is ready.
+    ``on_listen(info)`` is called with the edge's answer to ``info`` once it is ready.
     """
 
     unusable = 0
@@ -219,7 +219,7 @@ class FlightOutlet:
         )
         self.line_bytes[channel] += size_bytes
         self.messages[channel] += 1
-        if channel is not Channel.STATUS:  # it counts what the machine did
+        if channel is not Channel.STATUS:  # it holds figures of the machine
             self._digest.update(payload)
         self._link.put(
             Received(key, payload, attached, encoding, 0),

@@ -1,4 +1,4 @@
-"""What a flight's ground detects, lists and makes of stills, noted frame by frame for the metrics.
+"""The detections, lists and readings of stills of a flight's ground, noted frame by frame for the metrics.
 
 `Watch` stands between the ground's pipeline and its detector and refiner, passes everything on and remembers the last
 answer. Nothing here changes what is shown or sent.
@@ -47,7 +47,7 @@ class Watch:
         return self._found
 
     def take_found(self) -> Detections | None:
-        """What was detected on the base stream since the last time; None where nothing was looked for."""
+        """Detections on the base stream since the last time; None where nothing was searched."""
         found, self._found = self._found, None
         return found
 
@@ -74,11 +74,11 @@ class _Pending:
 
 
 class FlightRecord:
-    """Gathers between two lists; `complete` makes of a list what the metrics are given.
+    """Gathers between two lists; `complete` turns a list into the input of the metrics.
 
     ``classes`` is how many the detector knows. The ground's ``classifier`` is asked of each still and of the base
-    crop at its place; None takes what re-detection said of the still, and what the list said of the object at the
-    still's frame.
+    crop at its place; None takes the opinion of re-detection on the still, and that of the list on the object at
+    the still's frame.
     """
 
     def __init__(self, view: View, *, started_ns: int, classes: int, classifier: Classifier | None) -> None:
@@ -91,7 +91,7 @@ class FlightRecord:
         self._stills: list[StillArrival] = []
         self._pending: list[_Pending] = []
 
-    # What comes
+    # Arrivals
 
     def still(self, header: RoiHeader, arrival: Arrival[Received]) -> None:
         self._headers[header.sequence] = header
@@ -108,7 +108,7 @@ class FlightRecord:
         )
 
     def answers(self, results: Iterable[StillResult]) -> None:
-        """The ground has answered the edge: that is what it read in its stills."""
+        """The ground has answered the edge with the classes of its stills."""
         for one in results:
             if one.class_name:
                 opinion = Opinion(one.class_name, one.confidence, one.entropy_nats)
@@ -134,10 +134,10 @@ class FlightRecord:
             _Pending(done, header.frame_index, event.edge_track_id, self._view.to_source(box))
         )
 
-    # What is listed
+    # Lists
 
     def listed(self, overlay: Overlay, tracks: Tracks) -> ObservedFrame:
-        """A list, with the same tracks before refinement; what has left the picture is in ``tracks`` alone."""
+        """A list, with the same tracks before refinement; those outside the picture are in ``tracks`` alone."""
         rows = np.flatnonzero(np.isin(tracks.ids, overlay.track_ids))
         assert np.array_equal(overlay.track_ids, tracks.ids[rows]), "both are of the same list"
         return ObservedFrame(
@@ -179,7 +179,7 @@ class FlightRecord:
         )
 
     def _opinions_on(self, event: Refinement, header: RoiHeader) -> tuple[Opinion | None, Opinion | None]:
-        """What the classifier says of the base crop and of the still."""
+        """The classifier's opinions on the base crop and on the still."""
         if self._classifier is None or event.base_crop_bgr is None or event.still_bgr is None:
             return None, None
         boxes = (event.box_base_px,) * (2 if header.also else 1)  # one of several has to be cut out
@@ -202,7 +202,7 @@ class FlightRecord:
         return replace(one.done, base=base, still=read)
 
     def _in_list(self, view: FrameView, box_source_px: Boxes) -> Opinion | None:
-        """What a list said at an object's place."""
+        """The opinion of a list at an object's place."""
         if not len(view):
             return None
         overlap = iou(box_source_px, view.boxes_xyxy_px)[0]

@@ -1,7 +1,7 @@
 """What does the ground show at this budget on my clip? The methods at some rates over one clip, flown and scored.
 
 The runs are those of `hvt-study run`, without the matching of totals: same methods, same cache, same scores. *Labels*
-are exact where the source knows what it shows (the demo, an annotated picture under the virtual camera), else
+are exact where the source knows its objects (the demo, an annotated picture under the virtual camera), else
 *reference* labels (`hvt_study.datasets.reference`).
 """
 
@@ -49,7 +49,7 @@ _REPORT_EVERY_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class ComparePlan:
-    """What to compare."""
+    """The plan of a comparison."""
 
     clip: str
     """A video, a folder of images, ``demo``, or ``still:PICTURE``."""
@@ -70,7 +70,7 @@ class ComparePlan:
 _Run: TypeAlias = tuple[int, str]
 CompareRow: TypeAlias = dict[str, Any]
 """One flight over the whole clip (``half`` 0) or one half of it (1, 2), by the names of `_FIGURES`; docs/compare.md
-says what they are. What is not of the list is of the whole clip, in all three alike."""
+defines them. Figures that are not of the list are of the whole clip, in all three alike."""
 
 _FIGURES = (
     *(("named_f1", "named_f1{half}", 4), ("false_per_frame", "false_per_frame{half}", 3)),
@@ -218,7 +218,7 @@ def _distinct_flights(spec: RunSpec, *, beside: Collection[str], sizes: int) -> 
 
 
 def _work_of_a_flight(spec: RunSpec) -> float:
-    """What one of the run's flights takes to another's of its kind: fewer bits take less, and fewer frames.
+    """The work of one of the run's flights relative to others of its kind: fewer bits and fewer frames take less.
 
     The powers are those of 70 flights of a comparison from 150 to 800 kbps and from 15 frames a second to one.
     """
@@ -228,7 +228,7 @@ def _work_of_a_flight(spec: RunSpec) -> float:
 
 
 def _in_order(specs: Mapping[_Run, RunSpec]) -> tuple[list[_Run], list[_Run]]:
-    """First what flies once at one rate, so that what flights of each kind take is known soon.
+    """First runs that fly once at one rate, so that the time of flights of each kind is known soon.
 
     Then those of several flights, so that no process is left with one at the end.
     """
@@ -249,7 +249,7 @@ def _in_order(specs: Mapping[_Run, RunSpec]) -> tuple[list[_Run], list[_Run]]:
 
 
 def _kind(method: Method) -> str:
-    """What decides most of what a flight takes: the perception of the edge."""
+    """The part that decides most of the time of a flight: the perception of the edge."""
     if "source" in method.flags:
         return "source"
     return "video" if method.flags == METHODS["M0"].flags else "decoded"
@@ -262,7 +262,7 @@ def _opened(plan: ComparePlan) -> tuple[str, Sequence]:
     if clip == "demo":
         uri = "demo:0"
     elif clip.startswith(SCHEME):
-        camera = open_camera(clip, fps=1, annotated=False)  # says what is wrong with picture and height
+        camera = open_camera(clip, fps=1, annotated=False)  # names faults of picture and height
         uri = f"{SCHEME}{camera.picture_path}"
         options["view"] = f"{camera.view_heights:g}"
     elif (Path(clip) / "gt" / "gt.txt").is_file():
@@ -284,7 +284,7 @@ def _opened(plan: ComparePlan) -> tuple[str, Sequence]:
 
 
 def _label_options(plan: ComparePlan, uri: str) -> dict[str, str]:
-    """What the clip's own labels are to be read with."""
+    """The options to read the clip's own labels with."""
     scheme = uri.partition(":")[0]
     own = scheme in ("still", "mot")
     if own and plan.labels == "reference":

@@ -1,12 +1,12 @@
-"""Which runs a study takes: first those that decide what they spend, then video at each of their totals.
+"""The runs of a study: first those that choose their own spending, then video at each of their totals.
 
-Of an earlier start in the same folder those rows stay that this one has nothing better for. Who adds a method, a
-budget or a sequence to ``--out`` gets a table of all, and who is interrupted loses no finished run. Of one run two
-rows never stand: what was flown now takes the place of what was flown before.
+Rows of an earlier start in the same folder stay unless this one has better ones. So a method, a budget or a sequence
+may be added to ``--out``, and an interrupted study loses no finished run. One run never has two rows: the new one
+replaces the old.
 
-Runs all that a study takes, some at a time, wherever a pool puts them; results come as they are ready.
+Does all runs of a study, some at a time, wherever a pool puts them; results come as they are ready.
 
-A pool is anything with ``submit``: processes of this machine, or the workers of a Dask cluster. What is finished lies
+A pool is anything with ``submit``: processes of this machine, or the workers of a Dask cluster. A finished run lies
 in the cache; a study that was killed and is started again takes it from there.
 """
 
@@ -32,7 +32,7 @@ from hvt_study.runs.video_shape import SAME_TOTAL, grid_target
 
 @dataclass(frozen=True, slots=True)
 class Regime:
-    """A budget and what it is called."""
+    """A budget and its name."""
 
     name: str
     budget_bps: int
@@ -40,7 +40,7 @@ class Regime:
 
 @dataclass(frozen=True, slots=True)
 class StudyPlan:
-    """What to compare, on what, with what."""
+    """The methods, budgets, sequences and models of a study."""
 
     sequences: tuple[tuple[str, str], ...]
     """(URI of the dataset, name of the sequence)."""
@@ -175,7 +175,7 @@ def _up_to_date(row: RunRow, totals: Mapping[str, int | None]) -> bool:
 
 
 def _place(row: RunRow) -> str:
-    """Names a run that decides what it spends, by what it is and not by how: those that match its total share it."""
+    """Names a run that chooses its own spending, but for its budget: runs that match its total share the name."""
     run = said_run(row)
     if not run:
         return str(row["key"])
@@ -198,8 +198,8 @@ def run_all(
 
     ``run(spec)`` is done in the pool. ``on_row(row, done, of)`` is called for each finished run; ``of`` sinks
     where a run has failed that others were to match. No more than ``at_once`` runs are handed to the pool at a time:
-    what follows from a finished run goes before what has not begun, so that a sequence's pictures are looked at while
-    they are warm.
+    runs that follow from a finished one go before new ones, so that a sequence's pictures are used while they are
+    warm.
     """
     agenda = _Agenda(plan)
     rows: list[RunRow] = []
@@ -234,7 +234,7 @@ def in_order(plan: StudyPlan, rows: Iterable[RunRow]) -> list[RunRow]:
 
 
 class _Agenda:
-    """What is to be done. Of two runs that are one flight the second waits, and finds the result of the first."""
+    """The open runs. Of two runs that are one flight the second waits, and finds the result of the first."""
 
     def __init__(self, plan: StudyPlan) -> None:
         self._plan = plan

@@ -26,11 +26,11 @@ _GOES_ON = "finished runs are kept, and the same command goes on from there"
 
 @contextmanager
 def local_pool(jobs: int) -> Iterator[Executor]:
-    """So many processes. On an error they end at once: what is finished is in the cache.
+    """So many processes. On an error they end at once: finished runs are in the cache.
 
     Raises `UserError` where a process was killed.
     """
-    # Fresh processes: a fork would share threads and locks of what is open here.
+    # Fresh processes: a fork would share threads and locks of open files and models.
     context = multiprocessing.get_context("spawn")
     pool = _Processes(jobs, mp_context=context, initializer=_prepare)
     try:
@@ -83,7 +83,7 @@ class _Processes(ProcessPoolExecutor):
     """Starts its processes deaf to Ctrl-C: one that is still being imported would answer it with a traceback."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        # What is blocked is inherited; here it is only late.
+        # Blocked signals are inherited; here they are only late.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             return super().submit(fn, *args, **kwargs)
@@ -107,7 +107,7 @@ def _end_with_parent() -> None:
 
 
 def _end(pool: ProcessPoolExecutor) -> None:
-    """Let go of what is running; Python 3.14 has `terminate_workers` for it."""
+    """Let go of running work; Python 3.14 has `terminate_workers` for it."""
     for process in list((pool._processes or {}).values()):  # noqa: SLF001
         process.terminate()
 

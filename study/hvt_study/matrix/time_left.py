@@ -1,7 +1,7 @@
-"""How long runs still take: each kind by what the flights of its own took. Pure: time is an argument.
+"""How long runs still take: each kind by the time of its own earlier flights. Pure: time is an argument.
 
 A flight of one method takes up to ten times as long as that of another: how fast the last ones were says little of
-those to come. But what makes one take longer than those of its kind before, such as other programs, makes all slower.
+those to come. But other programs, which make one slower than earlier ones of its kind, make all slower.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 _Run = TypeVar("_Run", bound=Hashable)
 
 _REST = 0.3
-"""Of a run that nears its expected time or takes longer, so much of what it took is taken to be left."""
+"""A run that nears its expected time or takes longer is expected to need this share of its time so far again."""
 _NEWEST = 0.4
 """Weight of the newest run among those of its kind, at least; and of how much it is off, for all other kinds."""
 
@@ -23,8 +23,8 @@ class TimeLeft(Generic[_Run]):
     """``runs``, in the order in which so many workers take them, with how much work each is, 0 where others do it.
 
     ``kinds`` are names of runs of which the same work takes about as long, the narrowest first: the first of which
-    something is known counts. The first run of each worker says nothing: what is done once, such as reading the clip,
-    is done in it.
+    something is known counts. The first run of each worker says nothing: it includes work done once, such as reading
+    the clip.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class TimeLeft(Generic[_Run]):
             self._begin(now_s, 0)
         self._first = set(self._began)
         self._unit_s: dict[str, float] = {}
-        """What one of work takes now, by kind."""
+        """Seconds for one unit of work now, by kind."""
         self._ended: Counter[str] = Counter()
         """Runs of a kind that count."""
 

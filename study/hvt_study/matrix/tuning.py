@@ -18,7 +18,7 @@ _ACCEPTED = (
 
 
 def tuned_methods(words: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """By method, what `RunSpec.tune` is: each word is ``METHOD:KEY=VALUE,…`` or a tune.json. Later words win.
+    """`RunSpec.tune` by method: each word is ``METHOD:KEY=VALUE,…`` or a tune.json. Later words win.
 
     Raises:
         UserError: a word is neither, the method sends no stills or has no such parameter, or its value is none.

@@ -1,1 +1,1 @@
-"""Pure functions on what was there and what the ground showed: `class_score`, `tracking_score` and others."""
+"""Pure functions on the labels and the lists of the ground: `class_score`, `tracking_score` and others."""

@@ -1,4 +1,4 @@
-"""Bits and stills: what a run spent, and on what.
+"""Bits and stills: the spending of a run.
 
 Sizes are line bytes (payload, metadata and transport) as the ledger counts them. They are divided by the processed
 span. The pilot's notebooks divided the bytes of the 300 frames that they processed by the length of the whole clip;
@@ -34,7 +34,7 @@ def line_rates(row_bytes: Mapping[str, int], *, seconds: float) -> dict[str, flo
 def still_counts(
     stills: Sequence[StillArrival], refined: Sequence[RefinedObject], *, seconds: float
 ) -> dict[str, float]:
-    """Count what arrived, and the distinct tracks of the ground on whose class a still has spoken.
+    """Count arrived stills, and the distinct tracks of the ground on whose class a still has spoken.
 
     ``seconds`` are as in `line_rates`; the mean size, of payloads, is NaN where there is none.
     """
@@ -70,7 +70,7 @@ _RATES = (
 def in_accounting(rows: Iterable[Mapping[str, Any]], accounting: Accounting) -> list[dict[str, Any]]:
     """The same rows with their rates in this accounting, whichever they were in.
 
-    All runs of a sequence are divided by the same time: what matched, matches. Rates of failed runs stay null;
+    All runs of a sequence are divided by the same time: equal rates stay equal. Rates of failed runs stay null;
     a rate that cannot be said in this accounting, as the times are not known, becomes null.
     """
     return [_restated(row, accounting) for row in rows]

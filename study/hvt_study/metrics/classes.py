@@ -31,7 +31,7 @@ from hvt_study.datasets.labels import NO_ID
 from hvt_study.metrics.judged import LIMITS_PX2, SIZES, Judged, Size, matched_rows, of_size
 
 _NOBODY = -1
-"""Stands for the class of what has no partner."""
+"""Stands for the class of an object without a partner."""
 
 _Codes = npt.NDArray[np.int64]
 """Classes as numbers, the same for labels and boxes."""

@@ -105,7 +105,7 @@ def _dataset(category: Mapping[str, int], frames: Sequence[_Frame]) -> dict[str,
 
 
 def _mean(precision: _Precision) -> AveragePrecision:
-    """Of (IoUs, recalls, …), over what has labels."""
+    """Of (IoUs, recalls, …), over classes with labels."""
     return AveragePrecision(_known_mean(precision[0]), _known_mean(precision))
 
 

@@ -1,4 +1,4 @@
-"""For each frame what was there, what the ground showed, and what of both is judged.
+"""For each frame the labels, the boxes of the ground, and those of both that are judged.
 
 All boxes are x1 y1 x2 y2 in source pixels. A frame is a frame of the source at 15 a second, coded or not. Nothing in
 ignored regions is judged, all in one vocabulary, and only classes that the labels know.
@@ -35,7 +35,7 @@ def no_numbers() -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True)
 class FrameView:
-    """What the ground shows at one frame, N boxes; an empty one shows nothing."""
+    """The boxes of the ground at one frame, N of them; an empty one shows nothing."""
 
     boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
     """(N, 4) float32, source pixels, inside the frame."""
@@ -46,7 +46,7 @@ class FrameView:
     confidences: npt.NDArray[np.float32] = field(default_factory=no_numbers)
     """(N,) of the class that is shown, 0…1."""
     names_before: tuple[str, ...] = ()
-    """N names without refinement: what the base stream says."""
+    """N names without refinement, from the base stream."""
 
     def __post_init__(self) -> None:
         counts = {len(self.boxes_xyxy_px), len(self.ids), len(self.class_names), len(self.confidences)}
@@ -98,7 +98,7 @@ _IGNORED_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """The N labels of one frame that count, and what was shown beside them."""
+    """The N labels of one frame that count, and the boxes shown beside them."""
 
     boxes_xyxy_px: npt.NDArray[np.float64]
     """(N, 4), source pixels."""
@@ -116,12 +116,12 @@ class Judged:
 def judged(
     labelled: LabelledFrames, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
 ) -> list[Judged]:
-    """Take out of every frame of a sequence what is not to be judged.
+    """Take labels and boxes that are not judged out of every frame of a sequence.
 
     ``word`` brings the names of labels and boxes into one vocabulary, such as
     `hvt_common.inference.class_names.kind_of`. Labels and boxes of other ``classes`` (names in it) are left out; None
     keeps all. A box stays where its name before *or* after refinement is one of them, so that no still can take a
-    false box out of the account. What merely moves (`MOVING`) may be of any class and stays.
+    false box out of the account. An object that merely moves (`MOVING`) may be of any class and stays.
     """
     return [_judged(labels, view, word, classes) for labels, view in labelled]
 
@@ -172,7 +172,7 @@ def matched_rows(labels_xyxy_px: Floats, shown_xyxy_px: Floats) -> npt.NDArray[n
     """
     if not len(labels_xyxy_px) or not len(shown_xyxy_px):
         return np.empty((0, 2), np.int64)
-    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - what needs no figures runs without it
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - commands without figures run without it
 
     overlap = iou(labels_xyxy_px, shown_xyxy_px)
     enough = overlap >= LEAST_IOU

@@ -1,6 +1,6 @@
-"""What a flight records of the ground at every frame and of its stills, the views that metrics take, and proxies.
+"""The records of a flight's ground at every frame and of its stills, the views that metrics take, and proxies.
 
-The pilot's proxy metrics compare what one model says of an object on the base, and of the same object in a still.
+The pilot's proxy metrics compare one model's opinions on an object in the base and on the same object in a still.
 They need no labels and prove nothing about right or wrong: a model may be surer and wrong. They are here to be set
 beside the pilot's printed table. For each pair of opinions:
 
@@ -50,7 +50,7 @@ class StillArrival:
 
 @dataclass(frozen=True, slots=True)
 class Opinion:
-    """What a model says of one crop."""
+    """A model's opinion on one crop."""
 
     class_name: str
     confidence: float
@@ -59,7 +59,7 @@ class Opinion:
 
 @dataclass(frozen=True, slots=True)
 class RefinedObject:
-    """One object in a still, and what the ground made of it; a still that shows several has one of these for each."""
+    """One object in a still, and the ground's result; a still that shows several has one of these for each."""
 
     still_sequence: int
     track_id: int
@@ -99,7 +99,7 @@ class ObservedFrame:
     origins: tuple[str, ...] = ()
     """N words of `hvt_ground.events.Origin`: who knows of the track."""
     detections: FrameView | None = None
-    """What the ground's detector said of this decoded frame, from the tracker's weak confidence on, before any
+    """The boxes of the ground's detector in this decoded frame, from the tracker's weak confidence on, before any
     tracking; None at frames that were not coded or not detected on."""
     stills: tuple[StillArrival, ...] = ()
     """Arrived since the frame before; those after the last frame stand with it."""
@@ -115,7 +115,7 @@ class ObservedFrame:
     def base_view(self) -> FrameView:
         """The tracks that the base stream knows of, with names and confidences as without stills.
 
-        Where the edge reports its tracks too, a box is what both say together. That no still was sent does not give
+        Where the edge reports its tracks too, a box is fused from both. That no still was sent does not give
         their bits back to the video: the fair video-only figure is that of M0 at equal bits.
         """
         known = np.array([origin in ("base", "edge+base") for origin in self.origins], np.bool_)
@@ -129,7 +129,7 @@ def refined_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels]
 
 
 def detected_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels]) -> list[LabelledFrame]:
-    """The base frames that the ground detected on, with plain detections: what mAP is of."""
+    """The base frames that the ground detected on, with plain detections, for mAP."""
     pairs = [(truth, one.detections) for one, truth in zip(lists, labels, strict=True)]
     return [(truth, found) for truth, found in pairs if found is not None]
 
@@ -167,7 +167,7 @@ def proxies(objects: Iterable[RefinedObject]) -> dict[str, float]:
 def score_entropy_nats(confidence: float, classes: int) -> float:
     """Entropy of a detector's answer: its score p for one of ``classes``, the rest spread evenly over the others.
 
-    -p ln p - (1-p) ln((1-p)/(classes-1)), which is what re-detection of a still without a second opinion has too.
+    -p ln p - (1-p) ln((1-p)/(classes-1)), as re-detection of a still without a second opinion has it too.
     """
     p = min(max(confidence, 0.0), 1.0)
     rest = 1 - p

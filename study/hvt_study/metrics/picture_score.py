@@ -1,4 +1,4 @@
-"""What a detector is worth on labelled pictures: at the confidence of use and over the whole curve.
+"""The worth of a detector on labelled pictures: at the confidence of use and over the whole curve.
 
 A box is right where it is matched one to one, at IoU 0.5 or more, with a label of its class (`judged.matched_rows`).
 Expected calibration error is that of Guo et al. 2017 (https://arxiv.org/abs/1706.04599), over boxes instead of
@@ -128,9 +128,9 @@ def above(frames: Sequence[LabelledFrame], confidence: float) -> list[LabelledFr
 def picture_score(
     used: Sequence[Judged], curve: DetectionScore, *, recall_only: bool = False
 ) -> dict[str, Any]:
-    """What ``score.json`` holds of pictures with boxes from the confidence of use on, and of the whole ``curve``.
+    """The content of ``score.json``: of boxes from the confidence of use on, and of the whole ``curve``.
 
-    None stands for what cannot be said: with ``recall_only`` no box is known to be wrong.
+    None stands for an unknown figure: with ``recall_only`` no box is known to be wrong.
     """
     seen = sorted({name for one in used for name in (*one.class_names, *one.view.class_names)})
     points = {name: operating_point(used, name=name) for name in seen}

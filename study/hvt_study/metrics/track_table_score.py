@@ -1,4 +1,4 @@
-"""How well the ground knows what is there: classes of its tracks against ground truth, on every frame."""
+"""The classes of the ground's tracks against ground truth, on every frame."""
 
 from __future__ import annotations
 

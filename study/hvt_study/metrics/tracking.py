@@ -131,7 +131,7 @@ class TrackingScore:
 
 
 def tracking_score(frames: Iterable[Judged]) -> TrackingScore:
-    """Compare what is shown at every frame with the labelled tracks.
+    """Compare the tracks shown at every frame with the labelled ones.
 
     Labels without ids say nothing of tracks: where none has one, every figure is NaN.
     """

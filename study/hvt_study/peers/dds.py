@@ -1,12 +1,12 @@
 """A server-driven two-pass peer in the manner of DDS, on our codec, our link and our accounting.
 
 Du et al., "Server-Driven Video Streaming for Deep Learning Inference", SIGCOMM 2020. The edge sends every frame at a
-low quality; the ground looks at a segment of them, keeps what it is sure of and asks for the regions that it is not
-sure of; the edge codes the same frames again with these regions alone, the rest black; the ground pastes them into
-the first pass, looks again, and merges both into the final results, over which a tracker runs. What is as in
-DDS and what differs: docs/design-notes/dds.md.
+low quality; the ground looks at a segment of them, keeps sure objects and asks for the regions of unsure ones; the
+edge codes the same frames again with these regions alone, the rest black; the ground pastes them into the first pass,
+looks again, and merges both into the final results, over which a tracker runs. docs/design-notes/dds.md lists the
+differences from DDS.
 
-Every byte counts, once: the first pass as ``base``, the second as ``roi``, what the ground asks as ``control``. All
+Every byte counts, once: the first pass as ``base``, the second as ``roi``, requests of the ground as ``control``. All
 of it stays within the budget in every rolling window, and over the clip: the last second pass, which comes after the
 clip's end, is cut short where it would go beyond.
 """
@@ -64,7 +64,7 @@ class _Held:
 
 @dataclass(slots=True)
 class DdsGround:
-    """Takes what the line delivers; frames are finished in order, each when the pass that completes it is there.
+    """Takes the messages of the line; frames are finished in order, each when the pass that completes it is there.
 
     A frame about which nothing is asked is complete with its segment's question, that is when the last frame of the
     segment is there; one that the edge had to leave out, when a later one comes. Between two coded frames the list is
@@ -83,7 +83,7 @@ class DdsGround:
     shown_ns: list[tuple[int, int]] = field(default_factory=list)
     """(arrival, capture) of every picture of the first pass."""
     requests: deque[tuple[int, bytes]] = field(default_factory=deque)
-    """What the edge is to hear, with the time at which it does."""
+    """Requests to the edge, with the time at which it hears them."""
     _held: dict[int, _Held] = field(default_factory=dict)
     _last_frames: dict[int, tuple[int, ...]] = field(init=False)
     _first: BaseDecoder = field(init=False)
@@ -112,7 +112,7 @@ class DdsGround:
             self._finish()
 
     def close(self, *, frames: int) -> None:
-        """Nothing more comes: finish what is left, and list every frame up to the last."""
+        """Nothing more comes: finish the rest, and list every frame up to the last."""
         for held in self._held.values():
             held.whole = True
         self._finish()
@@ -268,7 +268,7 @@ def _segments(coded: frozenset[int], segment_frames: int) -> tuple[tuple[int, ..
 
 
 def _by_frame(source: FrameSource, frames: int) -> Generator[tuple[int, Frame | None], None, None]:
-    """(time, frame to code) of every frame, and empty ones after the clip for what is still to come."""
+    """(time, frame to code) of every frame, and empty ones after the clip for messages still to come."""
     frame_index = 0
     for frame in source.frames(start_ns=START_NS):
         for between in range(frame_index, frame.index):

@@ -1,4 +1,4 @@
-"""The camera's end of the two-pass peer: codes every frame once, and what is asked for a second time."""
+"""The camera's end of the two-pass peer: codes every frame once, and requested regions a second time."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from hvt_study.peers.dds_line import Line, header_bps
 from hvt_study.peers.dds_regions import Blocks, DdsSettings, RegionRequest, block_grid, pasted
 
 _KEYFRAME_DEBT_S = 10
-"""x265 never takes back what the first keyframe costs beyond a frame's share: so much media time pays for it."""
+"""x265 never takes back the bits of the first keyframe beyond a frame's share: so much media time pays for them."""
 _BLACK_FRAME_BYTES = 100
-"""What x265 takes for a frame with very little in it."""
+"""The size of a frame with very little in it, by x265."""
 _STORED_SEGMENTS = 4
 _STORED_LEAST = 8
 
 
 @dataclass(frozen=True, slots=True)
 class PassRates:
-    """What the budget gives each pass: the payload that its encoder is opened for."""
+    """Each pass's part of the budget: the payload rate of its encoder."""
 
     first_bps: int
     second_bps: int
@@ -38,7 +38,7 @@ class PassRates:
 
 
 def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings) -> PassRates:
-    """Share out a budget of line bits a second; `UserError` where x265 cannot follow what is left for a pass."""
+    """Share out a budget of line bits a second; `UserError` where x265 cannot follow the rate left for a pass."""
     request_bps = settings.request_bps
     first_line = settings.share * (budget_bps - request_bps)
     second_line = budget_bps - request_bps - first_line
@@ -69,7 +69,7 @@ def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings)
 def _beside_bps(
     line_bps: float, row: Channel, size: tuple[int, int], *, fps: float, messages_per_s: float
 ) -> float:
-    """What of a pass's rate is not x265's to spend."""
+    """The part of a pass's rate that x265 may not spend."""
     headers = header_bps(line_bps, units_per_s=fps, messages_per_s=messages_per_s, row=row)
     return headers + 8 * keyframe_floor_bytes(size) / _KEYFRAME_DEBT_S
 
@@ -149,7 +149,7 @@ class DdsEdge:
                 self._requested.append((frame_index, blocks))
 
     def second_pass(self, now_ns: int) -> None:
-        """Code and send what was asked for, as far as the budget has room now."""
+        """Code and send requested regions, as far as the budget has room now."""
         began_s = time.process_time()
         while not self.idle:
             self._fill()
@@ -157,7 +157,7 @@ class DdsEdge:
             if self._line.total_bytes + size_bytes > self._most_bytes:
                 self._ready.clear()
                 self._requested.clear()
-                self._most_bytes = 0  # what comes later would build on what was left out
+                self._most_bytes = 0  # later ones would build on those left out
                 break
             if size_bytes > self._budget.still_allowance(now_ns):
                 break

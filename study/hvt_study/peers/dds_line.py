@@ -17,7 +17,7 @@ from hvt_edge.link.budget import RollingBudget
 from hvt_study.flights.flight_link import Arrival, SerialLink
 
 HEADER_BYTES = 44
-"""What a `BaseHeader` takes at most."""
+"""The largest `BaseHeader`."""
 _SESSION = 1 << 31  # as many bytes on the wire as a random one
 _CHANNELS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.CONTROL: Account.META}
 _KEYS = EdgeKeys("edge-1")
@@ -35,14 +35,14 @@ class UnitMessage:
 
 
 def header_bps(line_bps: float, *, units_per_s: float, messages_per_s: float, row: Channel) -> float:
-    """What headers and transport take of ``line_bps``."""
+    """The part of headers and transport in ``line_bps``."""
     payload = round(line_bps / 8 / messages_per_s)
     around = HEADER_BYTES + overhead_bytes(payload, HEADER_BYTES, key=_KEYS.key(row), encoding=_VIDEO)
     return 8 * (messages_per_s * around + (units_per_s - messages_per_s) * _FURTHER.size)
 
 
 class Line:
-    """Both directions. Edge to ground goes over a simulated link; what the ground asks takes its own time back."""
+    """Both directions. Edge to ground goes over a simulated link; requests of the ground take their own time back."""
 
     def __init__(self, *, link_bps: int, budget: RollingBudget, window_ns: int) -> None:
         self.budget = budget
@@ -51,7 +51,7 @@ class Line:
         self.messages: Counter[str] = Counter()
         self.max_frame_bytes = 0
         self.arrivals: list[Arrival[None]] = []
-        """Everything that crossed, without what was in it."""
+        """All messages that crossed, without their content."""
         self._link: SerialLink[UnitMessage] = SerialLink(rate_bps=link_bps)
         self._link_bps = link_bps
         self._digest = hashlib.sha256()
@@ -104,7 +104,7 @@ class Line:
         return at_ns + round(size_bytes * 8 * SECOND_NS / self._link_bps)
 
     def arrived(self, now_ns: int) -> list[Arrival[UnitMessage]]:
-        """What the ground has got by now."""
+        """Messages that have reached the ground by now."""
         there = self._link.arrived(now_ns)
         self._under_way -= len(there)
         self.arrivals += [
@@ -143,6 +143,6 @@ class Line:
 
 
 def _payload(units: Sequence[AccessUnit]) -> bytes:
-    """The first is the header's; the others say what they are."""
+    """The first is the header's; the others carry their own kind."""
     first, *others = units
     return first.data + b"".join(_FURTHER.pack(one.frame_index, len(one.data)) + one.data for one in others)

@@ -42,11 +42,11 @@ class DdsSettings:
     scale: float = 1.0
     """Of the first pass: its width and height as shares of the base size. The second has all of it."""
     low: float = 0.1
-    """From here a result of the first pass is uncertain: what DDS takes from a region proposal network."""
+    """From here a result of the first pass is uncertain: DDS takes it from a region proposal network."""
     high: float = 0.4
     """From here it is confident (``prune_score``)."""
     overlap_iou: float = 0.3
-    """What overlaps a confident result with more is known already (``objfilter_iou``)."""
+    """A region that overlaps a confident result with more is known already (``objfilter_iou``)."""
     max_area: float = 0.04
     """A larger region is not asked for (``size_obj``)."""
     merge_iou: float = 0.3
@@ -87,12 +87,12 @@ class DdsSettings:
 
     @property
     def window_ns(self) -> int:
-        """Of the budget: a second, or what holds two frames."""
+        """Of the budget: a second, or long enough for two frames."""
         return round(1e9 * max(1.0, 2 / self.rate))
 
     @property
     def request_bps(self) -> float:
-        """What requests may take of the budget."""
+        """The part of the budget for requests."""
         return 8 * self.request_bytes * NOMINAL_FPS / self.segment_frames
 
     def first_size(self, size: tuple[int, int]) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""What can be read with each method at each rate: hybrids at the budget, video at the bits that they spent.
+"""The codes read with each method at each rate: hybrids at the budget, video at the bits that they spent.
 
 Video is matched to the hybrid that spent most at a rate, so that it never has fewer bits than they.
 ``M0-best`` is video at the size and frame rate at which most codes are read, chosen for each scene after the flight:
@@ -40,7 +40,7 @@ _HEIGHT_EDGES_PX = (0.0, 8.0, 11.0, 1e6)
 
 @dataclass(frozen=True, slots=True)
 class ReadPlan:
-    """What to read."""
+    """The plan of a comparison by reading."""
 
     dataset: str
     """URI of scenes with codes, such as ``demo:0-2,codes``."""
@@ -101,7 +101,7 @@ class ReadRow:
         return [(replace(code, object_id=number), found) for number, (code, found) in enumerate(pairs)]
 
     def figures(self) -> dict[str, Any]:
-        """As JSON holds them; docs/legibility.md says what they are."""
+        """For JSON; docs/legibility.md defines them."""
         found: dict[str, Any] = {
             "rate_kbps": self.rate_kbps,
             "method": self.method,
@@ -127,7 +127,7 @@ class ReadResult:
 
     rows: tuple[ReadRow, ...]
     missing: tuple[tuple[float, str, str], ...]
-    """(rate in kbps, method, why) of what could not be flown."""
+    """(rate in kbps, method, why) of flights that failed."""
     reader: str
 
 
@@ -247,7 +247,7 @@ def _scene_figures(one: SceneReading) -> dict[str, Any]:
 
 
 def _said(one: Evidence | None) -> dict[str, Any] | None:
-    """What was read first right, or else with most confidence; None where the channel never showed it."""
+    """The first right reading, or else the most confident one; None where the channel never showed the code."""
     if one is None or one.best is None:
         return None
     return {

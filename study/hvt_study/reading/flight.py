@@ -36,7 +36,7 @@ _EVERY_FRAMES = 5  # of the source, as of the base
 
 @dataclass(frozen=True, slots=True)
 class ReadFlight:
-    """What a flight cost, and what could be read of it."""
+    """The cost of a flight, and its readings."""
 
     size: tuple[int, int]
     """(width, height) of the base stream; of the source where that was read itself."""
@@ -70,7 +70,7 @@ class Readings:
         return self._context.sequence.source_size
 
     def source(self) -> ReadFlight:
-        """What can be read of the source itself: the most that any link could show."""
+        """The readings of the source itself: the most that any link could show."""
 
         def read() -> ReadFlight:
             evidence: dict[int, Evidence] = {}
@@ -89,7 +89,7 @@ class Readings:
         return self._known(key, lambda: self._fly(spec, budget_bps=budget_bps, fps=fps))
 
     def matched(self, spec: RunSpec, *, target_bps: int, fps: float | None) -> ReadFlight | None:
-        """Video that spends what another method spent, within one per cent; None where no budget does."""
+        """Video that spends the same as another method, within one per cent; None where no budget does."""
 
         def spends(budget_bps: int) -> float | None:
             shape = VideoShape(fps)
@@ -160,7 +160,7 @@ class Readings:
 
 
 class _ReadGround(GroundSide):
-    """Shows the observer what arrives."""
+    """Shows arriving pictures to the observer."""
 
     def __init__(self, info: Info, *, observer: CodeObserver, **named: Any) -> None:
         self._observer = observer
@@ -178,7 +178,7 @@ class _ReadGround(GroundSide):
         return super()._make_worker(analyze_observed, step, read_observed)
 
 
-# What the cache holds
+# The cache
 
 
 def _packed(flight: ReadFlight) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Stands beside a flight's ground with a reader, and has it read what arrives: base pictures, stills, the composite.
+"""Stands beside a flight's ground with a reader, and has it read arriving base pictures, stills and the composite.
 
 Of the truth the reader gets one thing: the box around a code at the frame that a picture shows. It does not learn
 which way the code is turned, how many characters it has, or which ones may occur.
@@ -23,7 +23,7 @@ from hvt_study.reading.score import LEAST_VISIBLE, Code, CodeReader, Evidence, c
 
 Channel = Literal["base", "stills", "composite"]
 CHANNELS: tuple[Channel, ...] = ("base", "stills", "composite")
-"""What is read: base pictures alone, stills alone, and stills laid over the base picture at the source's size."""
+"""The pictures to read: base alone, stills alone, and stills laid over the base picture at the source's size."""
 
 _EVERY_FRAMES = 5
 """Of base pictures one in so many frames is read: three a second, as an operator would look at most."""
@@ -34,9 +34,9 @@ INSIDE_SHARE = 0.98
 
 
 class CodeObserver:
-    """Is shown what a flight's ground has received, at the media time ``at_ns``; changes nothing.
+    """Sees all pictures that a flight's ground receives, at the media time ``at_ns``; changes nothing.
 
-    ``codes`` are what there is to read, by object, and ``views`` the codes in view, by frame of the clip.
+    ``codes`` are all codes to read, by object, and ``views`` the codes in view, by frame of the clip.
     """
 
     def __init__(
@@ -57,10 +57,10 @@ class CodeObserver:
         self._pending: list[ReceivedStill] = []
         self._next_read = 0
         self.evidence: dict[Channel, dict[int, Evidence]] = {channel: {} for channel in CHANNELS}
-        """By channel and object. What the composite shows, it shows beside the base: it has that reading too."""
+        """By channel and object. The composite contains the base: it has that reading too."""
 
     def picture(self, picture: DecodedFrame, *, at_ns: int) -> None:
-        """Read what is due on the base, and the stills that waited for this picture."""
+        """Read the codes due on the base, and the stills that waited for this picture."""
         self._pictures[picture.frame_index] = picture
         while len(self._pictures) > _REMEMBERED:
             self._pictures.popitem(last=False)

@@ -30,14 +30,14 @@ _MARGIN = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What the reader says of one picture."""
+    """The reader's answer on one picture."""
 
     text: str
     """Capitals and digits without spaces; empty where it reads nothing."""
     confidence: float
     """0…1, by its own account."""
     picture_bgr: Image
-    """What it was read from, turned as it was read."""
+    """The picture of the reading, turned as it was read."""
 
 
 class CodeReader:
@@ -73,7 +73,7 @@ class CodeReader:
 
 
 def code_crop(image: Image, box_px: Sequence[float]) -> Image:
-    """The part of a picture around a box x1 y1 x2 y2, its shorter side enlarged to what the reader takes.
+    """The part of a picture around a box x1 y1 x2 y2, its shorter side enlarged to the reader's size.
 
     Sub-pixel exact and cubic: the coarser picture gets its best chance.
     """
@@ -117,7 +117,7 @@ class Code:
 
 @dataclass(slots=True)
 class Evidence:
-    """What one channel has shown of one code: grows while a flight lasts."""
+    """The readings of one code in one channel: grows while a flight lasts."""
 
     read_s: float = math.inf
     """Media time at which the picture arrived that was first read right."""
@@ -152,7 +152,7 @@ class ChannelScore:
 
 
 def codes_to_read(views: Sequence[Iterable[CodeInView]]) -> dict[int, Code]:
-    """The codes of a clip by object, from what is in view in each of its frames; those in view for a second."""
+    """The codes of a clip by object, from those in view in each of its frames; those in view for a second."""
     seen: dict[int, list[tuple[int, CodeInView]]] = {}
     for frame_index, codes in enumerate(views):
         for one in codes:

@@ -1,4 +1,4 @@
-"""Tables of a report: a row a method and regime, the matrix of one figure, pairs, and what stands beside them."""
+"""Tables of a report: a row a method and regime, the matrix of one figure, pairs, and their notes."""
 
 from __future__ import annotations
 
@@ -281,7 +281,7 @@ def _ahead(pair: Pair) -> str:
 
 
 def metrics_table(accounting: str) -> Table:
-    """What each figure is, where rates are of this accounting."""
+    """The meaning of each figure, where rates are of this accounting."""
     better = {"more": "higher", "less": "lower", "": NOTHING}
     rows = tuple(
         cells(one.group, one.title, one.name, definition(one, accounting), better[one.better])
@@ -319,7 +319,7 @@ _TYPES = {"policy": str, "selected": int, "ratio": float, "frame_coverage": floa
 def sweep_table(path: Path) -> Table | None:
     """The selector sweep that ``hvt-study sweep --out`` left here; None where there is none.
 
-    Raises `UserError` where the file is not what that command writes.
+    Raises `UserError` where the file is not of that command.
     """
     if not path.exists():
         return None

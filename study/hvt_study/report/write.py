@@ -1,4 +1,4 @@
-"""From ``results.parquet`` and what else lies in studies' folders to one table, pages and figures.
+"""From ``results.parquet`` and the other files of studies' folders to one table, pages and figures.
 
 The HTML page needs no other file: style, drawings and pictures are in it, and nothing is loaded from the network. It
 takes the reader's light or dark, and prints on A4. The templates lie beside this file.
@@ -41,7 +41,7 @@ def markdown_page(report: Report) -> str:
 
 
 def inline_svg(drawing: Drawing) -> str:
-    """A drawing within a page: without what only files need, its names its own, its black the page's ink."""
+    """A drawing within a page: without the parts for files, its names its own, its black the page's ink."""
     svg = drawing.svg[drawing.svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
@@ -55,7 +55,7 @@ def inline_svg(drawing: Drawing) -> str:
     svg = svg.replace("#000000", "currentColor").replace(
         "'DejaVu Sans'", "system-ui, 'DejaVu Sans', sans-serif"
     )
-    # What is black says nothing of its fill.
+    # Black shapes have no fill of their own.
     label = f'<svg fill="currentColor" role="img" aria-label="{escape(drawing.alternative)}"'
     # The size in points would hold it back; its shape is in the viewBox.
     head, rest = svg.split(">", 1)
@@ -95,8 +95,8 @@ def write_report(folder: Path, *, accounting: Accounting | None = None) -> None:
 
     Figures of an earlier report that this one does not have are removed.
 
-    ``accounting`` is what the pages divide rates by; None: what the table does. Raises `UserError` where the table
-    cannot be used, or the folder not be written.
+    ``accounting`` is the time that the pages divide rates by; None: that of the table. Raises `UserError` where the
+    table cannot be used, or the folder not be written.
     """
     rows = read_results(folder / RESULTS)
     report = make_report(

@@ -48,7 +48,7 @@ _SAYS_OF_ONE = {
     *("top1_all_before", "top1_all", "found_share", "gaps", "longest_gap_s", "id_switches"),
     *("first_correct_p50_s", "first_correct_p90_s", "first_correct_never"),
 }
-"""What labels of one target can say: of the rest of the list nobody knows whether it is right."""
+"""Figures that labels of one target allow: nobody knows whether the rest of the list is right."""
 
 
 _OF_A_LIST = ("named_f1", "false_per_frame", "recall", "precision", "f1")
@@ -71,7 +71,7 @@ def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
 def _bits(report: FlightReport, context: RunContext) -> dict[str, Any]:
     seconds, clip_s = report.duration_s, context.sequence.duration_s
     span, pilot = (line_rates(report.line_bytes, seconds=one) for one in (seconds, clip_s))
-    # Of a server its questions, which are a row of what crossed the line.
+    # Of a server its questions, which are one row of the line bytes.
     back_bytes = report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)
     return {
         "duration_s": seconds,
@@ -124,7 +124,7 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
 
 
 def _halves(frames: Sequence[Judged]) -> dict[str, float]:
-    """Of the list in each half of the clip: what is tuned on one half must hold in the other."""
+    """Of the list in each half of the clip: a setting tuned on one half must hold in the other."""
     middle = len(frames) // 2
     found: dict[str, float] = {}
     for half, part in enumerate((frames[:middle], frames[middle:]), start=1):
@@ -168,7 +168,7 @@ def runner(cache: Path) -> Callable[[RunSpec], RunRow]:
 
 
 def run_spec(spec: RunSpec, *, cache: Path, folder: Path = Path(), study: str = "") -> RunRow:
-    """Do one run; what the edge refuses, or no one has foreseen, is a row that says so.
+    """Do one run; a refusal of the edge, or an unforeseen error, becomes a row that says so.
 
     Paths that are not absolute begin at ``folder``, such as the one in which the study was started; files are taken
     to be the same as long as it is the same ``study``. A `UserError` ends it: dataset or models cannot be used, or
@@ -278,7 +278,7 @@ class _Flights:
         )
 
     def _weight(self, budget_bps: int, shape: VideoShape) -> float:
-        """What a flight at this budget spends; without a ground, which has no say in it."""
+        """The spending of a flight at this budget; without a ground, which cannot change it."""
 
         def dry_run(context: RunContext) -> RunRow:
             return {

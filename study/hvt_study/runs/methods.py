@@ -1,4 +1,4 @@
-"""What the study compares: each method as settings of the edge, and how its bits are matched with the others'."""
+"""The methods of a study: each as settings of the edge, and how its bits are matched with the others'."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DDS = "DDS"
 
 
 class Kind(StrEnum):
-    """What a method does with the budget."""
+    """The use that a method makes of the budget."""
 
     VIDEO = "video"
     """Spends everything on video: it is coded again for the total of each method that does not."""

@@ -1,7 +1,7 @@
-"""What the runs over one sequence are made from, what names their results, and what all flights over it share.
+"""The inputs of the runs over one sequence, the names of their results, and the parts that all flights share.
 
-A study that is started again asks for little more than its `Materials`, for which no picture is looked at: what it
-finds in its cache needs none.
+A study that is started again asks for little more than its `Materials`, for which no picture is read: cached results
+need none.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ class Materials:
     """Reads the stills; None where the detector does, or nobody."""
     content: dict[str, str]
     software: dict[str, str]
-    """All that has a say beside that, by name; what runs the networks too."""
+    """All other versions that matter, by name; the provider of the networks too."""
 
 
 def open_materials(spec: RunSpec, *, cache: Path) -> Materials:
-    """What this run is made from; what several runs share is opened once.
+    """The inputs of this run; inputs that several runs share are opened once.
 
     Raises `UserError` where the dataset or a model cannot be used, there are no labels, or they do not map.
     """
@@ -93,7 +93,7 @@ def open_materials(spec: RunSpec, *, cache: Path) -> Materials:
 
 @lru_cache(maxsize=1)
 def software_versions() -> dict[str, str]:
-    """Of everything that may change a result; of HVT's own code what is in its files, edited or not."""
+    """Of everything that may change a result; HVT's own code counts by its files, edited or not."""
     versions = {"hvt": __version__, "code": flight_code(), "python": platform.python_version()}
     libav = (f"{name} {'.'.join(map(str, one))}" for name, one in sorted(av.library_versions.items()))
     return {**versions, "machine": platform.machine(), **installed(_PACKAGES), "libav": " ".join(libav)}
@@ -117,7 +117,7 @@ def _literal(name: str) -> str:
 
 @lru_cache(maxsize=4)
 def _detector(side: str, spec: str, provider: str, memory: Path) -> CachedDetector:
-    """Each side has one of its own, whose CPU is its account; they share what is remembered."""
+    """Each side has one of its own, with its own account of CPU; they share the memory."""
     if spec == MOTION:
         raise UserError(f"{MOTION!r} as detector of the {side} remembers pictures: give a detection network")
     confidence = weak_confidence(default_confidence(spec))
@@ -143,7 +143,7 @@ def model_digests(models: ModelChoice) -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def begin_study(study: str) -> None:  # noqa: ARG001 - another one is another call
-    """Forget what was opened for another study: a worker of Dask lives on while labels are mended, models trained."""
+    """Forget all that is open for another study: Dask workers live on while labels are mended, models trained."""
     for known in (_sequence, _detector, _classifier, model_digests, _open, digest_of_file):
         known.cache_clear()
 
@@ -184,7 +184,7 @@ def _open(spec: RunSpec, cache: Path) -> RunContext:
 
 
 def open_pixels(clip: Clip) -> tuple[Clip, object]:
-    """The clip with its pixels in a file, if there is room, and what keeps that file.
+    """The clip with its pixels in a file, if there is room, and the owner of that file.
 
     Where the system allows it the file has no name from the first pixel on: it is gone with the process, whenever and
     however that ends.
@@ -220,9 +220,9 @@ def _with_reference(
     """The sequence in the words of the ground's models; processes that ask for the same wait for the first.
 
     Frames are looked at as they are, but never smaller than the ground sees them: of a clip that is smaller than the
-    base stream the detector would find less in the source than in what the link delivers. And they are looked at in
-    the tiles of ``--tiles auto``: without them the edge would find more in the source than the labels know, and what
-    it finds would be called false.
+    base stream the detector would find less in the source than in the delivered video. And they are searched in the
+    tiles of ``--tiles auto``: without them the edge would find more in the source than the labels know, and that
+    would be called false.
     """
     smaller = any(side < base for side, base in zip(sequence.source_size, base_size, strict=True))
     size = base_size if smaller else None

@@ -66,7 +66,7 @@ def edge_flags(
 
 
 def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> FlightPlan:
-    """The flight of this run at a budget; its link carries what the regime allows, whatever the budget.
+    """The flight of this run at a budget; its link carries the rate of the regime, whatever the budget.
 
     Raises `UserError` where the edge does not take these settings.
     """

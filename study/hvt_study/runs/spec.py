@@ -20,7 +20,7 @@ LabelKind = Literal["annotations", "reference"]
 
 @dataclass(frozen=True, slots=True)
 class ModelChoice:
-    """The networks of a run: what ``--detector`` and ``--classifier`` take."""
+    """The networks of a run: values of ``--detector`` and ``--classifier``."""
 
     detector: str
     """The ground's, and that of reference labels."""
@@ -38,7 +38,7 @@ class Target:
     method: str
     still_codec: str
     total_bps: int
-    """What that run really spent over the processed span."""
+    """The bits that run really spent over the processed span."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class RunSpec:
     detect_every: int = 5
     """Frames from one detection to the next, at the edge and at the ground. The peer looks at all that it codes."""
     target: Target | None = None
-    """For video-only methods: spend what this run spent; None: the budget itself."""
+    """For video-only methods: spend the same as this run; None: the budget itself."""
     tune: tuple[str, ...] = field(default=())
     """``KEY=VALUE`` of the method's parameters other than their defaults."""
 
@@ -118,7 +118,7 @@ def _dataset(uri: str, folder: Path) -> str:
 
 
 def _model(spec: str, folder: Path) -> str:
-    """What has a folder or a suffix in it is a path, as for `hvt_common.inference.store.resolve_model`."""
+    """A word with a folder or a suffix is a path, as for `hvt_common.inference.store.resolve_model`."""
     separators = (os.sep, os.altsep or os.sep)
     is_path = "." in spec or any(one in spec for one in separators)
     return str(folder / spec) if is_path and not spec.startswith("~") else spec
@@ -129,19 +129,19 @@ Type = Literal["text", "int", "real", "yes"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column, its type, what it says, and how the tables of the report show it."""
+    """A column, its type, its meaning, and how the tables of the report show it."""
 
     name: str
     type: Type
     group: str
-    """Of metrics; empty for what no table of the report shows."""
+    """Of metrics; empty for columns that no table of the report shows."""
     title: str
     style: Literal["", "share", "kbps", "count", "seconds", "ms", "bytes", "rate", "nats"]
     better: Literal["", "more", "less"]
     over: Literal["", "mean", "median"]
-    """What is taken over sequences: waits may be infinite, which a mean does not survive."""
+    """The average over sequences: waits may be infinite, which a mean does not survive."""
     description: str
-    """``{time}`` stands for what rates are divided by."""
+    """``{time}`` stands for the time that rates are divided by."""
 
 
 def _columns() -> tuple[Column, ...]:

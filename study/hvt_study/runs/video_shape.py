@@ -1,4 +1,4 @@
-"""Which budget makes a method spend what another spent, and which frame rate and size are best for video alone.
+"""The budget at which a method spends the same as another, and the best frame rate and size for video alone.
 
 A target is first put on a grid of one per cent, so that methods which spent nearly the same are compared with one
 and the same flight of video, whatever the order in which they were flown.
@@ -29,7 +29,7 @@ _TRIES, _MORE = 7, 9
 _ASIDE = 0.004
 """Of a budget: so far beside the best one the next is tried, where the curve has a step or falls."""
 _USUAL_RATIO = 0.85
-"""What a video-only method spends of the budget that it is given."""
+"""The share of its budget that a video-only method spends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def within(total_bps: float, target_bps: float) -> bool:
 def match(spends: Callable[[int], float | None], *, target_bps: float) -> Matched | None:
     """Find a budget for which ``spends(budget_bps)`` is close to the grid's target (of ``target_bps``).
 
-    The search is a secant in the logarithms of both, kept within what has been seen to be too much and too little;
+    The search is a secant in the logarithms of both, kept between budgets that were too large and too small;
     ``spends`` is asked sixteen times at most. It may jump, so that between two budgets is none that fits: after seven
     times those beside the best one are tried, until one is within the tolerance. The nearest that was seen is
     returned, whether or not it is. ``spends`` is None for a budget that cannot be flown, which ends the search: None
@@ -150,7 +150,7 @@ def search_shape(
 ) -> None:
     """Fly each shape once, from coarse to fine; ``sizes`` go from the smallest, the run's own (``nominal``) is one.
 
-    ``fly`` says what a flight was worth, None where it cannot be flown.
+    ``fly`` returns the worth of a flight, None where it cannot be flown.
     """
     worth = {fps: one for fps in rates if (one := fly(VideoShape(fps))) is not None}
     if not worth:

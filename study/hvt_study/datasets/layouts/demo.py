@@ -23,7 +23,7 @@ _LEAST_VISIBLE = 0.5
 
 
 def demo_labels(seed: int, spec: str, index: int) -> FrameLabels:
-    """The drawn truth of a seed, of the frame at ``index / 15`` seconds; what is mostly hidden is passed over."""
+    """The drawn truth of a seed, of the frame at ``index / 15`` seconds; mostly hidden objects are passed over."""
     truth = _scene(seed, spec).truth(index / NOMINAL_FPS)
     judged = truth.visible >= _LEAST_VISIBLE
     return FrameLabels(

@@ -1,4 +1,4 @@
-"""A sequence as a folder of numbered images, what is there and what is missing; and clips without labels."""
+"""A sequence as a folder of numbered images, present and missing ones; and clips without labels."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class ImageSequence:
         labels: TableLabels | None,
         attributes: Mapping[str, str] | None = None,
     ) -> Sequence:
-        """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown.
+        """The sequence as a flight plays it. Labels are read once, to name faults before anything is flown.
 
         Raises `UserError` where labels have nothing in them, and every box would be false; or count frames from
         another number on than images, and all would be of other images.
@@ -112,7 +112,7 @@ class ImageSequence:
 
 
 def image_size(file: Path) -> tuple[int, int]:
-    """(width, height) in pixels; `UserError` for what cannot be decoded."""
+    """(width, height) in pixels; `UserError` for a file that cannot be decoded."""
     data = np.fromfile(file, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if image is None:

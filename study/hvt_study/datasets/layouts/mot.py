@@ -10,10 +10,10 @@
 ROOT may be one sequence, or hold them below train/ and test/. CVAT's "MOT 1.1" has no seqinfo.ini; the frame rate is
 then given with ``?fps=``. Pixels count from 1.
 
-What counts goes by TrackEval (https://github.com/JonathonLuiten/TrackEval, ``mot_challenge_2d_box.py``): in the
+Which boxes count goes by TrackEval (https://github.com/JonathonLuiten/TrackEval, ``mot_challenge_2d_box.py``): in the
 published sequences boxes on distractors, static persons, reflections and persons on vehicles (crowds, too, and on
 MOT20 other vehicles) count neither for nor against, and anything else that is marked as not counting is nothing at
-all. Where a file names its own classes, what is marked so is passed over. MOT15 has no classes: all are pedestrians,
+all. Where a file names its own classes, rows marked so are passed over. MOT15 has no classes: all are pedestrians,
 and in place of class and visibility there is a place in the world, or -1,-1,-1.
 """
 
@@ -104,7 +104,7 @@ class TruthRows:
     """(N, 4) x1 y1 x2 y2 pixels that count from 0."""
     class_names: tuple[str, ...]
     judged: npt.NDArray[np.bool_]
-    """(N,) False for what does not count, and for what is hidden by half."""
+    """(N,) False for boxes that do not count, and for half-hidden ones."""
     classless: bool
     """MOT15's ten columns, which name no class: all are of the only name that was given, else pedestrians."""
 

@@ -1,4 +1,4 @@
-"""What may follow a dataset's path in its URI: ``?fps=24&labels=none``."""
+"""The options behind a dataset's path in its URI: ``?fps=24&labels=none``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HIGHEST_SEED = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """All of them; what is not given is as here."""
+    """All of them, with the defaults."""
 
     fps: float | None = None
     """Rate at which the images were taken, other than the dataset's own."""
@@ -37,7 +37,7 @@ class Options:
 
 
 def split_options(uri: str, place: str, *, accepted: Collection[str]) -> tuple[str, Options]:
-    """The path and the options of what follows the scheme.
+    """The path and the options behind the scheme.
 
     A `UserError` names the option that is not one, or its value.
     """

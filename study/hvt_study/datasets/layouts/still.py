@@ -22,7 +22,7 @@ from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera,
 
 
 def still_labels(picture: Path, view: float, seed: int, classes: tuple[str, ...], index: int) -> FrameLabels:
-    """What the virtual camera sees in frame ``index``, in its pixels; each mirror image is an object of its own."""
+    """The virtual camera's labels in frame ``index``, in its pixels; each mirror image is an object of its own."""
     labels = _camera(picture, view, seed, True, classes, _stamps(picture)).labels(index)
     assert labels is not None, "made for annotated pictures only"
     return labels

@@ -32,7 +32,7 @@ _LAYOUTS: Mapping[str, tuple[_Layout, frozenset[str]]] = {
     "clips": (open_clips, frozenset({"fps"})),
     "still": (open_stills, frozenset({"labels", "view", "seeds", "classes", "labelled"})),
 }
-"""What each scheme is, and the options that it takes. Only sequences that are asked for are opened."""
+"""The layout of each scheme, and its options. Only requested sequences are opened."""
 
 DATASETS = ("visdrone:ROOT", "uavdt:ROOT", "mot:ROOT", "clips:FOLDER", "demo:SEEDS", "still:FOLDER")
 _SHOWN_NAMES = 5
@@ -42,8 +42,8 @@ def open_dataset(uri: str, *, limit: int | None = None, only: Words[str] = ()) -
     """The sequences of a dataset, in natural order: at most ``limit``, and ``only`` those of these names or patterns.
 
     ``uri`` is one of `DATASETS`; options follow a question mark: ``visdrone:ROOT?fps=24``. Raises `UserError` for an
-    unknown scheme or option, where the layout lacks something or an annotation is wrong, or ``only`` names what is
-    not there.
+    unknown scheme or option, where the layout lacks something or an annotation is wrong, or ``only`` names a
+    sequence that is not there.
     """
     return tuple(one for _, one in open_datasets((uri,), limit=limit, only=only))
 
@@ -53,7 +53,7 @@ def open_datasets(
 ) -> Iterator[tuple[str, Sequence]]:
     """The same of several, each with its URI; ``limit`` is of each.
 
-    Raises `UserError` as `open_dataset`; what ``only`` names has to be in one of them, not in all.
+    Raises `UserError` as `open_dataset`; a name of ``only`` has to be in one of them, not in all.
     """
     uris = tuple(dict.fromkeys(uris))
     if limit is not None and limit < 1:

@@ -16,7 +16,7 @@ al., The Unmanned Aerial Vehicle Benchmark, ECCV 2018::
 
 Only the names of folders M0203 and files matter, not where below ROOT they lie. Categories are 1 car, 2 truck, 3 bus.
 Pixels count from 0. Where only ``_gt.txt`` is there, all objects are of class ``vehicle``: it is ``_gt_whole``
-without what leaves the frame.
+without objects that leave the frame.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _ATTRIBUTES = (
     *(("view", word) for word in ("front", "side", "bird")),
     ("duration", "long-term"),
 )
-"""What the columns of an attribute file mean, in their order."""
+"""The columns of an attribute file, in their order."""
 
 
 def open_uavdt(root: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:

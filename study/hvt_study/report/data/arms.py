@@ -42,7 +42,7 @@ USUAL = Conditions()
 
 
 def conditions_of(row: Mapping[str, Any]) -> Conditions:
-    """Out of ``config``; what it does not say is as usual."""
+    """Out of ``config``; missing ones are as usual."""
     return _said(row["config"])[0]
 
 
@@ -117,7 +117,7 @@ class Models:
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """A method in one regime, at its own budget; what averages are of."""
+    """A method in one regime, at its own budget: the unit of averages."""
 
     regime: str
     method: str
@@ -246,7 +246,7 @@ class Setting:
 
 
 def counts(row: RunRow) -> bool:
-    """Whether a run is in averages: it was flown, and it spends what it is to spend."""
+    """Whether a run is in averages: it was flown, and its spending matches."""
     return not row["failed"] and bool(row["matched"])
 
 
@@ -292,7 +292,7 @@ def sequence_of(row: RunRow) -> str:
 
 
 def picture_of(name: str) -> str:
-    """What a sequence, by its `sequence_of`, is flown over: several seeds of ``still:`` have one picture."""
+    """The picture of a sequence, by its `sequence_of`: several seeds of ``still:`` have one picture."""
     dataset, _, sequence = name.rpartition("#")
     place, _, options = dataset.rpartition("?")
     seeds = dict(parse_qsl(options)).get("seeds", "0")

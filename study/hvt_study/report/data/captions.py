@@ -1,9 +1,9 @@
 """How tables say a figure: means, bootstrap intervals and medians over sequences, names, digits, captions.
 
 The interval is SciPy's percentile bootstrap (Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, chapter
-13). A sequence is what is drawn, with all others over the same picture (`picture_of`): frames of one sequence are not
+13). Sequences are drawn, each with all others over the same picture (`picture_of`): frames of one sequence are not
 independent of each other, nor are seeds of one picture. Differences are drawn as pairs
-(`hvt_study.report.data.pairs`): what makes a sequence hard for both sides cancels.
+(`hvt_study.report.data.pairs`): the difficulty of a sequence for both sides cancels.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Interval:
 
 
 def interval_of(values: Mapping[str, float]) -> Interval:
-    """The mean of what is not NaN, by sequence, with its 95 % bootstrap interval.
+    """The mean of values that are not NaN, by sequence, with its 95 % bootstrap interval.
 
     The interval is NaN with fewer than `ENOUGH` sequences, of which those over one picture are one.
     """

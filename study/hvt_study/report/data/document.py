@@ -1,4 +1,4 @@
-"""What a report is made of, before it is a page: sections of paragraphs, tables, drawings and pictures."""
+"""The parts of a report, before it is a page: sections of paragraphs, tables, drawings and pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Head:
     number: bool = True
     """Set flush right."""
     says: str = ""
-    """What it is, for those who point at it."""
+    """The explanation for those who point at it."""
 
 
 def words(*texts: str) -> tuple[Head, ...]:
@@ -63,7 +63,7 @@ class Drawing:
     svg: str
     pdf: bytes
     alternative: str
-    """What it shows, for those who do not see it."""
+    """The description for those who do not see it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class Report:
 
 
 def numbered(section: Section, before: Counter[str]) -> list[tuple[str, Part]]:
-    """The parts of a section with what they are called, ``Table 3``, ``Figure 1``; paragraphs have no name.
+    """The parts of a section with their names, ``Table 3``, ``Figure 1``; paragraphs have no name.
 
     ``before`` counts those of the sections before, and is added to.
     """

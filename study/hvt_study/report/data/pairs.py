@@ -108,7 +108,7 @@ def needed_bps(points: Iterable[tuple[float, float]], *, level: float) -> float:
 
 
 def equal_quality(setting: Setting, arm: Arm, *, reference: str, column: str) -> EqualQuality:
-    """Read every sequence's curve at what the arm shows there."""
+    """Read every sequence's curve at the arm's value there."""
     video = setting.video(reference)
     runs = setting.runs(arm)
     levels, spent = values(runs, column), values(runs, "total_bps")

@@ -34,11 +34,11 @@ SCHEMA = pa.schema(
     ],
     metadata={"hvt": "results of hvt-study, one row a run"},
 )
-"""Text is empty where a run has none, figures are null; what a column says is its field's ``description``."""
+"""Text is empty where a run has none, figures are null; a column's meaning is its field's ``description``."""
 
 
 def write_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write the table, whole or not at all: what was there stays until the new one is complete.
+    """Write the table, whole or not at all: the old one stays until the new one is complete.
 
     NaN becomes null. A column that a row does not have is null, or the empty text. Raises `UserError` where the file
     cannot be written.
@@ -92,6 +92,6 @@ def _value(value: Any, column: Column) -> Any:
 
 
 def _why(error: BaseException) -> str:
-    """The first line of what a library says; of several lines the others are its own affairs."""
+    """The first line of a library's message; the others are its own affairs."""
     own = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return own.strip().partition("\n")[0].rstrip(".") or type(error).__name__

@@ -1,4 +1,4 @@
-"""One flight of a study from close by: which, by rule; what came of its stills; and how it went, second by second."""
+"""One flight of a study from close by: chosen by rule, with the results of its stills, second by second."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class CropExample:
-    """One still beside what it was cut from and what the base shows there; three pictures of one size, PNG."""
+    """One still beside the source and the base at its place; three pictures of one size, PNG."""
 
     percentile: int
     gain_db: float
@@ -54,7 +54,7 @@ class CropExample:
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """What a still said of a track, and when."""
+    """A still's class for a track, and when."""
 
     at_s: float
     before: str
@@ -162,7 +162,7 @@ def _median(setting: Setting, arm: Arm, runs: BySequence) -> Choice:
 
 
 def _gains(setting: Setting, arm: Arm, runs: BySequence) -> tuple[Mapping[str, float], str]:
-    """In named F1 by sequence, and over what."""
+    """In named F1 by sequence, and the reference."""
     for pair in (one for one in pairs(setting, references=("M0",)) if one.arm == arm):
         against = {name: gap for name, gap in pair.gaps(_GAIN).items() if name in runs}
         if against:
@@ -193,7 +193,7 @@ def save_example(folder: Path, example: Example) -> None:
 
 
 def load_example(folder: Path) -> Example | None:
-    """What was saved; None where nothing was. `UserError` where it is damaged."""
+    """The saved example; None where there is none. `UserError` where it is damaged."""
     place = folder / _FOLDER
     try:
         content = json.loads((place / _FILE).read_text(encoding="utf-8"))
@@ -238,7 +238,7 @@ def _is_picture(png: bytes) -> bool:
 def enlarged(png: bytes, *, least_px: int) -> bytes:
     """The PNG by the least whole factor that makes its longer side ``least_px``: every pixel becomes a square.
 
-    Readers of papers and Markdown smooth what they enlarge themselves.
+    Programs that show papers and Markdown smooth the pictures that they enlarge themselves.
     """
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None, "pictures are looked at where they are read"

@@ -1,6 +1,6 @@
 """Flies one run of a study again, to look at it: the rows of a table hold no pixels.
 
-The flight is the very same, to the bit; only the ground's side is asked to keep what it saw of its stills.
+The flight is the very same, to the bit; only the ground's side is asked to keep the pictures of its stills.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def _timeline(
 def _rates(
     arrivals: Sequence[Arrival[Received]], *, started_ns: int, seconds: int
 ) -> Mapping[str, tuple[float, ...]]:
-    """Kilobits handed to the link in each second; what comes after the last frame is the last second's."""
+    """Kilobits handed to the link in each second; bytes after the last frame are the last second's."""
     size_bytes: Counter[tuple[str, int]] = Counter()
     for one in arrivals:
         row = _row_of(one)

@@ -1,4 +1,4 @@
-"""Curves: utility over bitrate, and what the still codecs make of theirs."""
+"""Curves: utility over bitrate, and those of the still codecs."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """How figures look: for print, for every kind of colour vision, and legible in grey.
 
-The rate-utility plot of a comparison: what is shown over the bits that were really spent.
+The rate-utility plot of a comparison: utility over the bits that were really spent.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ def crop_pictures(example: Example) -> Pictures:
 
 
 def timeline_figure(example: Example, *, name: str) -> Drawing:
-    """Rate, stills with their track, and what is seen, over time."""
+    """Rate, stills with their track, and seen objects, over time."""
     timeline = example.timeline
 
     def paint(figure: Figure) -> None:
