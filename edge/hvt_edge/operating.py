@@ -76,7 +76,7 @@ class OperatingPoint:
     """The highest of all budgets that were in force."""
     preset: str = ""
     preset_says: str = ""
-    """The reason for the preset, in a line for the user; empty where it costs no quality."""
+    """The reason for the preset, in a line for the user; empty where nothing had to be given up."""
     levers: Levers = Levers()
     started_ns: int = 0
     """When the first frame was taken; 0 before."""

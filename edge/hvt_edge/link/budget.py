@@ -394,8 +394,8 @@ class RollingBudget:
         return free if self._settings.yields else min(free, self._window_allowance(now_ns, events))
 
     def _note_used(self, now_ns: int) -> None:
-        # At new rates the base's behaviour is known after a window. Other messages are no part of it, and can be
-        # repeated behind a requested still.
+        # At new rates the base's behaviour is known after a window. Other messages are no part of it, and go again
+        # behind a requested still.
         if now_ns >= self._old_peak[0]:
             self._used.append((now_ns, self._total - self._requested_free(now_ns, self._base_events)))
             while self._used[0][0] <= now_ns - _LEFT_WINDOWS * self._settings.window_ns:

@@ -31,7 +31,7 @@ class Report:
 class PrimaryReceiver:
     """Chooses the ground that steers: its reports count where several may report. Thread-safe; time is an argument.
 
-    Several grounds share the same thin link, and the messages of one say nothing of the others. So one is the primary
+    Several grounds see the same thin link, and the reports of one say nothing of the others. So one is the primary
     receiver: the first that reports, until it is silent for a second, or names nothing new for a second although
     another has had several messages since. At one frame a second there is nothing new for a second, and whichever of
     two healthy grounds reports first would be the only one that has the newest. Report numbers cost a forger

@@ -357,7 +357,7 @@ class Pacer:
             self._note_losses(feedback, now_ns)
             oldest = self._flight.oldest
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
-            if silent:  # at the least rate the rest would be overdue only long after it is lost
+            if silent:  # at the least rate waiting for the rest would take longer than giving it up
                 self._flight.clear()
             return_ns = now_ns - feedback.send_ns
             if sent is None or (
@@ -519,7 +519,7 @@ class Pacer:
         return True
 
     def _note_late(self, sent: Sent, held_ns: int, now_ns: int) -> None:
-        # The rate falls at once, and the queue with it: messages that stay late longer have a longer path.
+        # The rate falls at once, and the queue with it: if messages stay late after that, the path is longer.
         if self._late_ns(sent, now_ns) - held_ns <= _SLACK_NS:
             self._late_since_ns = None
         elif self._late_since_ns is None:

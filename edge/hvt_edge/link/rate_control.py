@@ -9,8 +9,8 @@ of the arrival rate meanwhile, which is the link's capacity. Messages sent befor
 and are not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
 
 Growth follows a cubic curve (RFC 9438, section 4.2, in time): quickly back to the rate of the last breakdown, long
-near it, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and a link that has
-come back is used in full again after some seconds.
+near it, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and the rate of a
+link that has come back is found again in some seconds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _SOME_OFF, _SOME_NS = 0.08, 3 * SECOND_NS
 _LITTLE_OFF = 0.02
 """The share that replaces it at the ceiling, where the rate will stay."""
 _REST_NS = 1_500 * _MS
-"""Between two openings; a third of it where the rate is higher by `_FAR_MORE`, because it grows in steps."""
+"""Least time between two openings; a third of it where the rate is higher by `_FAR_MORE`: it grows in steps."""
 _FAR_MORE = 1.5
 
 

@@ -71,7 +71,7 @@ class LockstepPace:
 
         A frame that is not coded is analyzed all the same: its source may show objects that no base frame does.
         """
-        del missed  # of a camera, which cannot run in lockstep
+        del missed  # frames of a camera, which does not wait
         if frame is None:
             return
         now_ns = frame.capture_ns

@@ -100,7 +100,7 @@ class RealtimePace:
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it.
 
-        ``missed`` counts frames of a live source that came before this loop took them. Without a frame it is None.
+        ``missed`` counts frames of a live source that this loop did not take in time. ``frame`` None: none has come.
         """
         if frame is None:
             self.before_frame(self.clock())
@@ -302,7 +302,7 @@ class LinkControl:
             )
         if self.backlog is not None:
             self.backlog.on_feedback(feedback, now_ns=now_ns)
-        # Last: a thread that waits there for the end then stores unacknowledged messages.
+        # After the outbox: a thread that waits there for the end then stores unacknowledged messages.
         self.inbox.on_report(report)
         if report.primary:
             self.transmitter.resend(feedback.missing_base, now_ns=now_ns)

@@ -6,9 +6,9 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
   on-demand keyframes included; with 0.2 s a keyframe on demand reaches 1.18. x265 leaves up to 40 % of the rate
   unused after a keyframe of a still scene (``strict-cbr`` only fills that up with filler): `SpareRate` uses it.
 * ``keyint=-1``: no keyframe comes by itself. The edge requests each one, so that stills can yield to it. x265 is
-  opened anew for it, in 2 ms: an open x265 never forgets the cost of earlier scenes, and gave a still one QP 51.
+  opened anew for it, in 2 ms: it never forgets the cost of earlier scenes, and coded a still one's keyframe at QP 51.
 * ``pools``: with several worker threads the row-level rate control sees a different order of rows each run, and the
-  same input gives other bytes. Lockstep therefore uses one; real time uses all cores, which halves the time of a
+  same input gives other bytes. Lockstep therefore uses one; real time uses several, which halves the time of a
   frame on two cores (keyframes 151 to 81 ms, others 23 to 13).
 * x265's workers lower their own priority by 10, to that of perception: a frame then takes twice as long wherever a
   network runs beside it. They get the frame loop's priority back, if the process has the right to raise it.
