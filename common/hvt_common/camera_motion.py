@@ -20,7 +20,7 @@ _LEAST_ALIKE: Final = 0.3
 _USUAL_TIMES: Final = 1.3
 """Multiple of the usual difference beyond noise, waves and steady motion."""
 _EXPOSURE: Final = 16.0
-"""Levels. By so much the whole picture may become brighter or darker from one step to the next."""
+"""The most levels by which the whole picture may become brighter or darker from one step to the next."""
 _NEWEST: Final = 4
 """The usual difference is the largest of this many: a source that repeats pictures has differences of 0 between."""
 _SCENE_LEVELS: Final = 4.0

@@ -105,9 +105,9 @@ def _is_output(path: Path) -> bool:
 
 
 def check_there(file: int, path: Path) -> None:
-    """Raise `FileNotFoundError` where no name leads to the open file any more: whoever looks would not find it.
+    """Raise `FileNotFoundError` where no name leads to the open file any more: nobody would find it.
 
-    One that was moved, or whose folder was, is where the system says.
+    A file that was moved, alone or with its folder, is where the system says.
     """
     if os.fstat(file).st_nlink == 0:
         raise FileNotFoundError(None, "it was removed", str(path))

@@ -35,7 +35,7 @@ def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
 
 
 def moved(latitude_deg: float, longitude_deg: float, *, north_m: float, east_m: float) -> tuple[float, float]:
-    """Latitude and longitude of a place so many metres away, degrees; longitude from -180 up to 180."""
+    """Latitude and longitude of a place ``north_m`` and ``east_m`` away, degrees; longitude from -180 up to 180."""
     north, east = metres_per_degree(latitude_deg)
     longitude = longitude_deg + east_m / max(east, 1e-6)
     return latitude_deg + north_m / north, turned_deg(longitude)

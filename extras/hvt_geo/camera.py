@@ -37,7 +37,7 @@ class Surface(Protocol):
         ...
 
     def below_m(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
-        """The ground's depth below the camera, (N,), so many metres north and east of it; NaN where not known."""
+        """The ground's depth below the camera, (N,), at ``metres`` north and east of it; NaN where not known."""
         ...
 
 
@@ -70,7 +70,7 @@ _LEAST_BOX_PX: Final = 1.0
 _MOST_LATITUDE_DEG: Final = 89.8
 """22 km from a pole."""
 _SURE: Final = 2.0
-"""A ray nearer to the horizon than so many standard deviations of the pitch tells no place."""
+"""A ray nearer to the horizon than 2 standard deviations of the pitch tells no place."""
 
 
 def at_a_pole(pose: Pose) -> bool:

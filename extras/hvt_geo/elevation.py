@@ -99,7 +99,7 @@ class Tile:
         return np.where(inside, upper * (1 - down) + lower * down, np.nan)
 
     def beside(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
-        """Elevation so many metres north and east of a pose, (…, 2 or 3)."""
+        """Elevation at ``metres`` north and east of a pose, (…, 2 or 3)."""
         north_m, east_m = metres_per_degree(pose.latitude_deg)
         longitude_deg = pose.longitude_deg + metres[..., 1] / max(east_m, 1e-6)
         return self.at(pose.latitude_deg + metres[..., 0] / north_m, longitude_deg)
@@ -248,7 +248,7 @@ class Terrain:
 
     The camera's height above the sea is ``altitude_m``; of a pose that says only a height above the ground, that is
     taken to be above the ground below the first pose. Where the model has no ground below the camera the log says so
-    once, with ``flight``, the name of whose it is. Where the model cannot be read, the part in memory counts, and it
+    once, with ``flight``, its name. Where the model cannot be read, the part in memory counts, and it
     is read again after a pause. ``clock`` is nanoseconds without steps.
     """
 

@@ -40,12 +40,12 @@ MOST_CONNECTIONS = 256
 MOST_OPEN = MOST_CONNECTIONS + 64
 """With those that are told that it is too many, or are in the middle of TLS."""
 REQUEST_S = 10.0
-"""So long a client may take for TLS, and from an answer to the next whole request."""
+"""The longest time of a client for TLS, and from an answer to the next whole request."""
 STALL_S = 20.0
-"""So long a client may take none of the sent bytes."""
+"""The longest time that a client may take none of the sent bytes."""
 _PART = "web page"
 _CLOSE_S = 5.0
-"""So long a closed connection may take for the rest."""
+"""The longest time of a closed connection for the rest."""
 _END_S = 2.0
 _LIST_ADDRESSES, _ROW_BYTES = 0x8912, 40 if struct.calcsize("P") == 8 else 32
 """SIOCGIFCONF and struct ifreq of netdevice(7)."""
@@ -274,7 +274,7 @@ class _BoundedProtocol(_NoStall, H11Protocol):
         self._await_request(None)
 
     def _take_place(self) -> bool:
-        # That of one of whoever has most; False where that is this client.
+        # The place of the address with most connections; False where that is this client's.
         known: set[Any] = set(self.connections)
         others = {
             one: one.client[0]

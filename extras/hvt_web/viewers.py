@@ -22,7 +22,7 @@ _MOST_QUEUED_BYTES = 4 * 2**20
 """Of a viewer; above, it loses pictures up to the next keyframe. Its first messages do not count."""
 _MOST_TEXTS = 2000
 _MOST_TEXT_BYTES = 4 * 2**20
-"""Text is not dropped: a viewer with so much of it unread is given up."""
+"""Text is not dropped: a viewer with more of it unread is given up."""
 _MOST_RETAINED_BYTES = 16 * 2**20
 _MOST_RETAINED = 2000
 """Fragments since the last keyframe."""
@@ -56,7 +56,7 @@ class Viewer:
         self.hopeless = False
         """It takes nothing at all any more: nothing is kept for it, and `take` raises."""
         self.reason = ""
-        """Of its end, in words for whoever looks at the page; at most 120 bytes."""
+        """Of its end, in words for the page; at most 120 bytes."""
         self._queue: deque[tuple[str | bytes, bool]] = deque()
         self._bytes = 0
         self._texts = self._text_bytes = 0

@@ -47,7 +47,7 @@ from hvt_ground.wiring import (
 _POLL_S = 0.1
 _STATUS_EVERY_POLLS = 10
 _STUCK_S = 5.0
-"""A ground that has made no state for so long does not serve its edges either."""
+"""A ground that makes no state for longer does not serve its edges either."""
 _MOST_SUMMARIES = 256
 """Limit for an edge: one that restarts for weeks must not fill the memory."""
 _MOST_MOVED = 256

@@ -75,7 +75,7 @@ class Opening:
     waits: bool = True
     """Whether an edge in lockstep waits for it; one that sends to others does not hold it up."""
     longest_pause_s: float = 60.0
-    """At most so long after a failure it is made again."""
+    """The longest pause after a failure before it is made again."""
 
 
 OpenSinks = Callable[[Flight], Iterable[Opening]]

@@ -19,7 +19,7 @@ STALE_S: Final = 10.0
 _MOST_POSES: Final = 64
 """A minute of them: pictures are not shown later than that."""
 _ANEW_AFTER: Final = 5
-"""After so many poses without a newer one they begin anew: the newest may be forged, or the edge's clock set back."""
+"""After 5 poses without a newer one they begin anew: the newest may be forged, or the edge's clock set back."""
 _DRIFT: Final = 0.5
 """Standard deviation of a change of motion, as a share of the motion in as long a time."""
 

@@ -106,7 +106,7 @@ Anchor = Literal["top-left", "centre", "stretch"]
 
 _FILL = 114  # the grey of YOLO letterboxes
 _ROWS_AT_ONCE = 128
-"""The planes of so many rows stay in the cache, and take no memory beside the picture."""
+"""The planes of this many rows stay in the cache, and take no memory beside the picture."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ import numpy.typing as npt
 from hvt_common.values import Boxes
 
 MAX_CANDIDATES = 8192
-"""At most so many of the most confident boxes are compared, so that no image costs more than a tenth of a second."""
+"""Only this many of the most confident boxes are compared, so that no image costs more than a tenth of a second."""
 MAX_DETECTIONS = 1000
-"""At most so many boxes are returned."""
+"""The most boxes that are returned."""
 _ALIKE = 0.6
 """Chosen on training pictures: of .5 to .7 the one of the best mean overlap with the labels."""
 WEAK = 0.1

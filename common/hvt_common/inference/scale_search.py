@@ -33,18 +33,18 @@ _FIRST, _EVERY = 3, 45
 _OTHER: Final = 2.0
 """Twice or half as many promised as at the last probe: another scene, which is probed at once."""
 _MORE, _LEAST_MORE = 3.0, 8.0
-"""The part must promise so many times as much enlarged, and so many objects more."""
+"""Enlarged, the part must promise 3 times as many objects, and 8 more."""
 _SEEN_WHOLE_PX: Final = 80
 """The whole picture's run sees objects from this length on; an enlarged part sees a bus in a crossing's stripes."""
 _STILL_MORE: Final = 2.0
 _IN_VAIN: Final = 3
-"""So many pictures in a row that promise less than `_STILL_MORE` times as much end it."""
+"""The search enlarged ends after this many pictures in a row that promise less than `_STILL_MORE` times as much."""
 _REDUCED_EVERY: Final = 3
 _SURE: Final = 0.5
 _RIGHT: Final = 5
-"""So many sure objects that are not large say that the scale is right: reduced, planters between them are buses."""
+"""With 5 sure objects that are not large the scale is right: reduced, planters between them would be buses."""
 _RARER: Final = 3
-"""Five runs in place of one are due so many times more rarely."""
+"""A search with five runs in place of one is due a third as often."""
 
 
 class ScaleSearch:
@@ -64,7 +64,7 @@ class ScaleSearch:
         """Each picture is looked at in parts, enlarged."""
 
     def interval(self, frames: int) -> int:
-        """Frames from one detection to the next, where they are so many with one run for each."""
+        """Frames from one detection to the next; ``frames`` are those with one run for each."""
         return frames * _RARER if self.enlarged else frames
 
     def take(self, whole: Detections, image_bgr: Image) -> Detections:

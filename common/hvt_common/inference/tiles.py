@@ -41,7 +41,7 @@ _SMALL_PX: Final = 12
 _SEEN_PX: Final = 10
 """… and the size it should have on the network's input: below, recall falls off steeply."""
 _BORDER_SHARE: Final = 0.004
-"""A box that ends so near a tile's border, as a share of the tile, may go on beyond."""
+"""Share of a tile: a box that ends so near its border may go on beyond it."""
 _SAME_IOU: Final = 0.45
 _ANY_CLASS_IOU: Final = 0.7
 _INSIDE: Final = 0.8
@@ -55,7 +55,7 @@ _SURE: Final = 0.5
 _PART: Final = 0.02
 """Of a vehicle's box; a person seen from above is a thirtieth."""
 _ACROSS: Final = 0.7
-"""Two partial are of one object if they share so much of the longer one's extent along the truncated."""
+"""Two partial boxes are of one object if they share this much of the longer one's extent along the cut side."""
 
 
 @runtime_checkable
@@ -218,7 +218,7 @@ def with_large(whole: Detections, image_bgr: Image, detect: Callable[[Image], De
 
 
 def are_large(boxes: Boxes, image_bgr: Image) -> npt.NDArray[np.bool_]:
-    """(N,) which of the boxes are so large in the picture that `with_large` looks for their like."""
+    """(N,) whether each box is as large in the picture as those that `with_large` looks for."""
     sides = boxes[:, 2:] - boxes[:, :2]
     return np.asarray(sides.max(axis=1) >= _LARGE_PX / _REDUCED_SIDE * max(image_bgr.shape[:2]))
 

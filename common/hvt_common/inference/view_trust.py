@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 _RUNS = 45
 """Detections on pictures: 15 s at the defaults (15 fps, every fifth frame)."""
 _LEAST_BOXES, _LEAST_PICTURES = 45, 10
-"""The newest pictures tell, no more of them than hold so many boxes: older ones may be of another scene."""
+"""The newest pictures with 45 boxes together decide, 10 at least: older ones may be of another scene."""
 _UNLIKE_BELOW = 0.47
 """Vehicles of 40 pixels aslant, of which it finds none, have .37; views that it knows .5 to .8."""
 _LIKE_FROM = 0.5

@@ -20,7 +20,7 @@ _Part = TypeVar("_Part")
 _Answer = TypeVar("_Answer")
 _REDACTION = Redaction()
 _STEADY_NS = 60 * SECOND_NS
-"""A failure after it worked for so long is news."""
+"""A failure of a part that worked for a minute is reported anew."""
 SILENT_NS = 10 * SECOND_NS
 """The slowest network answers sooner."""
 _STEADY_PAUSES = 10

@@ -87,7 +87,7 @@ def leave(code: int) -> NoReturn:
     """
     atexit._run_exitfuncs()  # noqa: SLF001 - `os._exit` leaves them out
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError):  # whoever read it is gone
+        with contextlib.suppress(OSError):  # its reader is gone
             stream.flush()
     os._exit(code)
 
@@ -124,9 +124,9 @@ def lower_priority(*, little: bool = False) -> None:
 def put_video_first() -> None:
     """Have nothing in this process hold up a frame on its way: not the interpreter, not OpenCV's workers.
 
-    A frame comes back from native code a dozen times, and waits each time for whoever tracks or reads a message: half
-    a millisecond at most from now on, instead of five. OpenCV works in the thread that calls it; workers of its own
-    have the priority of whoever called it first.
+    A frame comes back from native code a dozen times, and waits each time for threads that track or read messages:
+    half a millisecond at most from now on, instead of five. OpenCV works in the thread that calls it; its own workers
+    would have the priority of its first caller.
     """
     import cv2  # noqa: PLC0415 - programs that handle no picture set themselves up here too
 

@@ -44,7 +44,7 @@ _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 
 _LONGEST_S: Final = 10.0
-"""After so long without a detection the last one tells nothing of the picture now."""
+"""A detection older than this tells nothing of the present picture."""
 _LEAST_DETECTIONS: Final = 3
 """Detections that a lost track is remembered for, where they are further apart than the buffer is long."""
 _MOST_SHIFT: Final = 0.1
@@ -52,7 +52,7 @@ _MOST_SHIFT: Final = 0.1
 
 _OLD_S: Final = 1.5
 _OLD_GAPS: Final = 2
-"""Tracks not seen for so long, and for so many times the longest of the last gaps, are not listed."""
+"""Tracks not seen for 1.5 s, and for twice the longest of the last gaps between detections, are not listed."""
 
 _MOST_PICTURES: Final = 24
 """Kept while one of them is being searched: the objects found there are carried through all later ones."""
@@ -107,7 +107,7 @@ class ByteTracker:
         """How long after its frame the last update came."""
         self._next_id = 1
         self._steady = 0
-        """So many updates in a row found nearly all as predicted."""
+        """The number of updates in a row that found nearly all as predicted."""
         self._pictures.reset()
 
     @property
@@ -121,7 +121,7 @@ class ByteTracker:
         return self._pictures.scene_began
 
     def is_due(self, frames: int, *, every: int, most: int) -> bool:
-        """Whether the newest frame, so many after the one searched last, is to be searched.
+        """Whether to search the newest frame, which is ``frames`` after the last searched one.
 
         That is each ``every`` frames while something is to be confirmed or much has come into view; else twice or
         three times as many, up to ``most``, after updates that found nearly all as predicted, and ``most`` while the

@@ -78,7 +78,7 @@ def duplicates(table: TrackTable, boxes: _Floats) -> _Indices:
     lost, present = is_lost.nonzero()[0], (~is_lost).nonzero()[0]
     if not len(lost) or not len(present):
         return none
-    # Where the IoU is so large, no corner lies further from the other's.
+    # At such an IoU no corner lies further from the other's.
     now, before = boxes.take(present, axis=1), boxes.take(lost, axis=1)
     apart = np.maximum.reduce(np.abs(now[:2, :, None] - before[:2, None]))
     if not np.count_nonzero(apart < _MOST_APART * (1 + np.maximum.reduce(before[2:] - before[:2]))):

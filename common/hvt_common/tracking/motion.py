@@ -93,7 +93,7 @@ class Pictures:
 
 
 def move(table: TrackTable, step: Step, *, frames: int, hold_unconfirmed: bool) -> None:
-    """Take all tracks to a frame, so many after the one before, in place."""
+    """Move all tracks to a frame, ``frames`` after the one before, in place."""
     states = table.states
     then = states[kalman.POSITION].copy()
     for _ in range(frames - 1):

@@ -30,8 +30,8 @@ _MOST_SHARE: Final = 0.9
 _CAUTION: Final = 2
 """Unreported objects that are assumed at the start: after the first that both detect, nothing is known yet."""
 _OTHERS: Final = 20
-"""The rate over all classes counts as so many objects of each: few are enough to learn that a detector does not know
-one of them."""
+"""The rate over all classes counts as 20 objects of each: few are enough to learn that a detector does not know one
+of them."""
 _MEMORY_S: Final = 10.0
 
 

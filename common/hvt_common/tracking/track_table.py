@@ -19,9 +19,9 @@ _Scores = npt.NDArray[np.float32]
 _FARTHEST_PX: Final = 1e9
 
 UNCONFIRMED, LOST, OVER_TIME, TRACKED, OVERDUE, ENDED = range(6)
-"""The phases of a track: seen once; not found by the last update; not for so long that the next is its last chance;
-found by the last update; so at its last chance: lost once more, it is forgotten at once. None outlasts an update in
-the third or the last."""
+"""The phases of a track: seen once; not found by the last update; not found for long, the next update is its last
+chance; found by the last update; found at its last chance: lost once more, it is forgotten at once. The third and
+the last phase end with the next update."""
 
 IF_FOUND = np.array([TRACKED, TRACKED, OVERDUE, TRACKED, OVERDUE])
 IF_MISSED = np.array([ENDED, LOST, ENDED, LOST, ENDED])
@@ -125,7 +125,7 @@ class TrackTable:
         )
 
     def widened(self, classes: int) -> TrackTable:
-        """With votes on so many classes at least."""
+        """With votes on at least this many ``classes``."""
         missing = 1 + classes - len(self.scores)
         if missing <= 0:
             return self

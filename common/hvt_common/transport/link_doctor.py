@@ -1,4 +1,4 @@
-"""The door for whoever explains a link that is missing: an extra, by the entry point ``hvt.link``, or nobody."""
+"""The door for an extra that explains a missing link, by the entry point ``hvt.link``; without it nobody does."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 _EVERY_S = 0.25
 _UNREAD_EVERY_S, _UNREAD_CHECKS = 1.0, 5
 _HANGS_S = 0.5
-"""After so long a handshake is doubted: the place is probed, and again each time so much later."""
+"""A handshake that lasts longer is doubted: the place is probed, and again at this interval."""
 _PROBE_S = 3.0
 _LINGER, _NO_LINGER = struct.pack("ii", 1, 10), struct.pack("ii", 0, 0)
 _LAST_DATA_RECEIVED = 52

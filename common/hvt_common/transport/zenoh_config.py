@@ -115,7 +115,7 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
         # An edge that listens is served just as well. ("client" would wait at its start, deaf to Ctrl-C.)
         config.insert_json5("mode", '"router"')
     for endpoint in effective:
-        # With keys whoever connects must show a certificate.
+        # With keys a client must show a certificate.
         keys = _value(said, "transport/link/tls/enable_mtls") is True and endpoint.startswith(
             ("tls/", "quic/")
         )

@@ -26,7 +26,7 @@ _TIME_BASE = Fraction(1, 1000)
 _LONGEST = 2**31
 """MP4 has 32 bits for the time between two pictures: 24 days."""
 _SET_BACK = 1000
-"""A picture so much before the last one is of a clock that was set."""
+"""A picture this much before the last one is of a clock that was set."""
 _CRF = "20"
 
 

@@ -90,7 +90,7 @@ class Index:
     def pass_time(self, now: Moment, *, most_ns: int) -> int:
         """Note that time has passed; the nanoseconds by which the clock moved otherwise, and all times with it.
 
-        So the files keep their ages and their order, whoever sets the clock. The first to look with another clock
+        So the files keep their ages and their order when the clock is set. The first to look with another clock
         moves them, of all grounds that have the folder.
         """
         with self._database as transaction:

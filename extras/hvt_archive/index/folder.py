@@ -31,7 +31,7 @@ _AGAIN_NS = 3600 * SECOND_NS
 _END_S = 3.0
 _SET_NS = 10 * SECOND_NS
 _DOUBT_NS = 3600 * SECOND_NS
-"""For so long after the clock was set nothing goes for its age: who set it may set it again."""
+"""For this long after the clock was set no file goes for its age: the clock may be set again."""
 
 
 class IndexWriter(SinkWriter[RecordingRow | None]):

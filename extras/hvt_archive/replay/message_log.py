@@ -69,7 +69,7 @@ class MessageLog(SinkWriter[Received]):
         body: bytes = msgpack.packb(
             [item.received_ns, item.key, item.encoding, item.attachment, item.payload]
         )
-        if len(body) > _MOST_BYTES:  # no message of ours is so large, and a reader would stop at it
+        if len(body) > _MOST_BYTES:  # no message of ours is larger, and a reader would stop at it
             return
         record = _HEAD.pack(len(body), zlib.crc32(body)) + body
         if self._file.tell() + len(record) > self._most_bytes // 2:

@@ -26,7 +26,7 @@ _ANSWER_S = 1.0
 _ATTEMPT_S = 2.5
 """Limit of one attempt: a link that drops everything must not keep an edge from starting."""
 LEAVING_S = 5.0
-"""An edge that is shutting down still answers for so long; its successor is not refused because of it."""
+"""An edge that is shutting down may still answer for this long; its successor is not refused because of it."""
 _PAUSE_S = 0.5
 
 # A client, because a router or a ground passes nothing on between two peers; and one attempt to connect, because an

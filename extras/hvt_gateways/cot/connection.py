@@ -93,7 +93,7 @@ def check_connection(url: str, environment: Mapping[str, str] = os.environ) -> N
         ) from None
     if context.verify_mode == ssl.CERT_NONE:
         _log.warning("CoT %s: the server's certificate is not verified (%s)", url, _DONT_VERIFY)
-    # pytak says so at each connection, to whoever reads standard error.
+    # pytak says so at each connection, on standard error.
     warnings.filterwarnings("ignore", message="Disabled TLS", category=UserWarning)
 
 

@@ -1,4 +1,4 @@
-"""Which tracks are reported now: each at most once a second, and all of them at most so many a second.
+"""Which tracks are reported now: each at most once a second, and all of them within a rate.
 
 | a track                                          | is due after |
 |--------------------------------------------------|--------------|
@@ -23,7 +23,7 @@ from hvt_common.units import SECOND_NS
 from hvt_gateways.cot.event import Motion
 
 STALE_NS: Final = 5 * SECOND_NS
-"""After so long without another report a receiver takes an object for lost."""
+"""A receiver takes an object for lost after this long without a report."""
 _MOVED_NS: Final = SECOND_NS
 _UNMOVED_NS: Final = 3 * SECOND_NS
 _LEAST_MOVE: Final = 0.25

@@ -76,7 +76,7 @@ class McapFile(SinkWriter[Event]):
                 self._write("events", Log(level=_LEVELS[item.level], message=item.text), item)
 
     def skipped(self, count: int) -> None:
-        """So many events are missing: video goes on at its next keyframe."""
+        """``count`` events are missing: video goes on at its next keyframe."""
         del count
         self._run.interrupt()
 

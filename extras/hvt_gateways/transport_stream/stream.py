@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _BUFFER_BYTES: Final = 24 * 7 * 188
 """A buffer of whole datagrams of whole packets."""
 _DELAY_US: Final = "200000"
-"""Delay of a receiver's clock behind the times in the stream: metadata may come so much later than its picture."""
+"""Delay of a receiver's clock behind the times in the stream: metadata may come later than its picture by this."""
 _USUAL_FPS: Final = 15.0
 """A recording does not say it; it counts where a clock was set."""
 

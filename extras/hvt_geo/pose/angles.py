@@ -15,7 +15,7 @@ def compass_deg(yaw_deg: float) -> float:
 
 
 _UNIT = 0.1
-"""So much may the length of a quaternion differ from 1."""
+"""The length of a quaternion may differ from 1 by this."""
 
 
 def euler_deg(w: float, x: float, y: float, z: float) -> tuple[float, float, float] | None:

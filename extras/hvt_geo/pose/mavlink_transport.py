@@ -29,7 +29,7 @@ _USUAL_BAUD = 115_200
 _POLL_S = 0.2
 _CONNECT_S = 3.0
 _SILENT_S = 10.0
-"""A TCP server that says nothing for so long may be gone without a word: an autopilot says something every second."""
+"""A TCP server silent for longer may be gone without a word: an autopilot says something every second."""
 _READ_BYTES = 8192
 """At most, of a stream and of a datagram; autopilots send datagrams of at most 1500, and the rest of a longer one is
 dropped."""
@@ -88,7 +88,7 @@ class Address:
         return self.kind != "udpin"
 
     def open(self, *, silent_s: float) -> Link:
-        """Open it; a TCP server may be silent for so long. Raises `OSError` where that fails."""
+        """Open it; a TCP server may be silent for ``silent_s``. Raises `OSError` where that fails."""
         try:
             if self.kind == "udpin":
                 return _UdpPort(self.place, self.number)

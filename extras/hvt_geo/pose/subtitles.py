@@ -37,7 +37,7 @@ _DJI = {
 }
 """Names in the subtitles; ``longtitude`` is how some models spell it."""
 _IN_PARTS = {"focal_len": (200, 10), "dzoom_ratio": (200, 10_000)}
-"""A whole number beyond the first counts so many parts: 240 is 24 mm, and 480.00 a lens of 480 mm."""
+"""A whole number beyond the first value counts parts, the second many to one: 240 is 24 mm, 480.00 is 480 mm."""
 _MOST_LATITUDE = 90.0
 _MOST_SATELLITES = 60
 

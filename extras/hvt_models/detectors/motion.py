@@ -49,13 +49,13 @@ class MotionSettings:
     memory_calls: int = 6
     """The number of earlier images to compare with."""
     least_calls: int = 2
-    """Silent until so many images are stored."""
+    """Silent until this many images are stored."""
     max_side_px: int = 1280
     """A larger image is first scaled down to this longer side."""
     noise_factor: float = 6.0
-    """A pixel moves when its difference exceeds so many standard deviations of this image's differences …"""
+    """A pixel moves when its difference exceeds this many standard deviations of this image's differences …"""
     least_difference: float = 9.0
-    """… and so many grey levels of 255."""
+    """… and this many grey levels of 255."""
     seed_share: float = 0.2
     """Share of a region that must differ from all stored images but one."""
     join_px: int = 7
@@ -67,7 +67,7 @@ class MotionSettings:
     least_side_px: int = 4
     """… a region thinner than this, or …"""
     largest_aspect: float = 8.0
-    """… longer than so many times its width: the border of a letterboxed picture, for one."""
+    """… longer than this many times its width: the border of a letterboxed picture, for one."""
     largest_share: float = 0.25
     """A larger share of the image is no object."""
     scene_change_share: float = 0.4

@@ -36,7 +36,7 @@ _JPEG_EVERY_NS = 500_000_000
 _THUMBNAIL_EVERY_NS = 1_000_000_000
 _THUMBNAIL_WIDTH_PX = 320
 _KEYFRAME_EVERY_S = 2.0
-"""On the h264 rung: who joins decodes so much before the picture of now."""
+"""On the h264 rung: a newcomer decodes this much before the present picture."""
 _BT709 = 1
 """ITU-T H.273: of primaries, transfer and matrix alike."""
 _X264 = {

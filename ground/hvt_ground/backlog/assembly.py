@@ -36,7 +36,7 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 _MAX_UNREPORTED = 512
 _MAX_REFUSALS = 256
 _PATIENCE = 3
-"""An object that is unusable so often is unusable for good: it is acknowledged, so that it does not take the link."""
+"""An object that is unusable 3 times is so for good: it is acknowledged, so that it does not take the link."""
 
 
 BacklogContent = Info | ReceivedStill | tuple[BacklogUnit, ...]

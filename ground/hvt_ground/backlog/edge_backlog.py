@@ -4,8 +4,8 @@ Objects of the open session go there, those of a session before into a recording
 open session's perception worker when nothing newer is there: the picture of now goes first.
 They come into a recording by jobs of that worker, one step a frame.
 
-Of earlier sessions so many files a day at most, and of those so many open at a time, whatever an edge says that it
-stored: one that is started over and over, or somebody in its name, would fill the disk with them.
+The files for earlier sessions are bounded, by day and open at a time, whatever an edge says that it stored: an edge
+that is started over and over, or somebody in its name, would fill the disk with them.
 """
 
 from __future__ import annotations
@@ -189,8 +189,8 @@ class BacklogRecordings:
 
     Where more than ``most`` are open, the one that nothing came for the longest is closed. One that is in use is not:
     should all be, one more is open for the time being. When more comes of a session whose recording is closed, it
-    gets another file; at most ``most_files`` are made in a day. Whoever has one made waits up to ``open_s`` for its
-    file, and for as long nobody else does. ``clock`` is seconds without steps.
+    gets another file; at most ``most_files`` are made in a day. The caller that has one made waits up to ``open_s``
+    for its file, others not at all for as long. ``clock`` is seconds without steps.
     """
 
     open_one: Callable[[Info], BacklogRecording]

@@ -29,7 +29,7 @@ from hvt_ground.sinks import QueuedSink, Receipt
 
 _LEAST_IOU, _MOST_LATE = 0.4, 512
 _LONGEST_S = 1.0
-"""For so long one frame counts as video, where the next was left out."""
+"""The longest time that one frame counts as video, where the next was left out."""
 
 
 @dataclass(slots=True)

@@ -29,21 +29,21 @@ from hvt_common.units import SECOND_NS
 _log = logging.getLogger(__name__)
 
 _JOIN_S = 1.5
-"""After its start a member claims nothing for so long: it learns who is there."""
+"""After its start a member claims nothing meanwhile: it learns of the others."""
 _SETTLE_S = 0.3
 """Between a claim and serving: another claim of the same moment is seen by then."""
 _PASS_S = 10.0
-"""A member that has not claimed its edge for so long does not accept it: the others share it without that one."""
+"""A member that has not claimed its edge by then does not accept it: the others share it without that one."""
 _MOST_PAGE_BYTES = 512
 _ANSWER_S = 5.0
 _MOST_MEMBERS, _MOST_EDGES, _MOST_CLAIMS = 1024, 16384, 64
 """The last of one edge: tokens may be anybody's where there are no keys."""
 _BURST, _EVERY_NS = 60, SECOND_NS
-"""So many comings and goings are said at once, then one a second."""
+"""Up to 60 comings and goings are logged at once, then one a second."""
 
 
 def owner_of(edge: str, members: Iterable[str]) -> str:
-    """The member that serves the edge, whoever asks."""
+    """The member that serves the edge, the same to all members."""
 
     def weight(member: str) -> bytes:
         return hashlib.blake2b(f"{edge}/{member}".encode(), digest_size=16).digest()

@@ -47,13 +47,13 @@ its numbers cannot be true."""
 REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
 RESEND_UNITS, RESEND_WAIT_NS = 24, 700_000_000
-"""So many units, and so long, wait at most behind a hole that the edge was told of."""
+"""The most units that wait behind a hole that the edge was told of, and the longest wait."""
 _SLACK_NS = 120_000_000
 """Beyond the round trip, for the first: a resent unit waits behind the bytes that the link already holds."""
 _MOST_INTERVAL_NS, _MOST_HOLE_NS = 160_000_000, 210_000_000
 """From one unit to the next, and of all of a hole: more would be more of a second's bytes than are sent again."""
 _UNANSWERED, _UNANSWERED_NS, _MOST_UNANSWERED_NS = 3, 20_000_000_000, 640_000_000_000
-"""After so many holes in a row for which nothing came again none waits for so long; then one, and twice as long."""
+"""After 3 holes in a row without a resent unit no hole waits for 20 s; then one does, and the pause doubles."""
 _MUCH_SOONER = 1.25
 ORDERLY_UNITS = 30
 SILENCE_NS = 500_000_000
@@ -68,7 +68,7 @@ _WINDOW_MASK = (1 << SEQUENCE_SLACK) - 1
 _REMEMBERED_SESSIONS = 16
 _REQUEST_INTERVALS_NS = (300_000_000, 300_000_000, 300_000_000, 600_000_000, 1_000_000_000)
 _FRESH_NS = 100_000_000
-"""An edge takes a request that comes so soon behind a keyframe for answered by it (`KeyframeSettings.coding_ns`)."""
+"""An edge takes a request this soon behind a keyframe for answered by it (`KeyframeSettings.coding_ns`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ class Repair:
             self._pause_ns = min(2 * self._pause_ns, _MOST_UNANSWERED_NS)
 
     def waits(self, count: int, since_ns: int) -> bool:
-        """Whether a hole of so many units waits, behind which the first has come at ``since_ns``."""
+        """Whether a hole of ``count`` units waits, behind which the first has come at ``since_ns``."""
         return (
             self.round_trip_ns is not None
             and self.round_trip_ns + _SLACK_NS <= min(RESEND_WAIT_NS, RESEND_UNITS * self.interval_ns)

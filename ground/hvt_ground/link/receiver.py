@@ -38,12 +38,12 @@ _KINDS: Mapping[Channel, type[_Message]] = {
 }
 _ATTACHED = (Channel.BASE, Channel.ROI, Channel.BACKLOG)
 _SILENT_NS = 2_000_000_000
-"""A keyframe is requested only of an edge that sent something so long ago at most."""
+"""A keyframe is requested only of an edge that sent something within this time."""
 _MOST_HELD = 16
 """Stills, and poses, that are held for a session that is not open yet."""
 _UNSEEN_NS, _UNSEEN = 15 * SECOND_NS, 3
-"""An edge that says for so long that it sends pictures, and so many of them, of which none comes. A keyframe is coded
-for less than a second of the rate: it takes so long on a link of a fifteenth of that."""
+"""An edge reports for 15 s that it sent pictures, 3 at least, of which none came. A keyframe is coded for less than a
+second of the rate: it takes that long on a link of a fifteenth of it."""
 _AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""
 

@@ -55,11 +55,11 @@ _HELD_US = 2**32 - 1
 _NEAR_STILLS = 256
 """A still that is further from the highest number may be forged: it counts once another follows it."""
 _MISSED_NS = 6 * SECOND_NS
-"""A still that has not come for so long does not come any more: reports need not name it for ever."""
+"""A still that is overdue by this does not come any more: reports need not name it for ever."""
 _ANEW_NS = 5 * SECOND_NS
-"""Numbers that have to rise may begin anew after so long without a newer one: the high ones may have been forged."""
+"""After this long without a newer one, rising numbers may begin anew: the high ones may have been forged."""
 _LATELY_NS, _FRAMES_LATELY = 3 * SECOND_NS, 4
-"""A message that came longer ago, and so many frames ago, tells nothing of now."""
+"""A message that came longer ago than both tells nothing of the present."""
 _MOST_OBJECTS = 65_535
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""

@@ -26,13 +26,13 @@ _AGREED = {"car": 0.6}
 _AGREED_ELSE = 0.85
 """From this mean confidence on, 0 where it was called another kind, nine of ten are right (embedded-models.md)."""
 _REACH, _NOISE_PX = 0.5, 4.0
-"""It has moved when its middle is so many of its longer sides, and so many pixels, from where it stood."""
+"""It has moved when its middle is half its longer side, and 4 pixels, from where it stood."""
 _FORGOTTEN_S = 10.0
 """Where it stood follows it so slowly: the estimate of the camera's motion drifts."""
 _ON = 0.7
-"""One that shares so much of the smaller box with a surer one of its group is likely the same object once more."""
+"""A track that shares this much of the smaller box with a surer one of its group is likely the same object."""
 _NEIGHBOURS, _LARGER = 3, 2.0
-"""So many surer ones of its group speak for it, unless it is so many times larger or smaller than they mostly are."""
+"""Three surer ones of its group speak for it, unless it is twice as large or half as large as they mostly are."""
 
 _Floats = npt.NDArray[np.float64]
 

@@ -177,11 +177,11 @@ class Models:
         return (self._open_detector(), opened[1]) if self._config.detector == MOTION else opened
 
     def give_up(self) -> None:
-        """The run ends: whoever waits for them waits no longer."""
+        """The run ends: nobody waits for the models any longer."""
         self._opened.cancel()
 
     def _load(self) -> None:
-        if self._config.threads > 1:  # workers have the priority of whoever opens the network
+        if self._config.threads > 1:  # workers inherit the priority of the opening thread
             lower_priority()
         opened, failed = None, None
         try:

@@ -40,18 +40,18 @@ _FARTHEST_S = 5
 _GAP_S = 1.0
 """For how long the base stream may leave out frames and still tell where tracks were between."""
 _PUT_OFF = 4
-"""So many times the usual pause is the longest between two detections, where one is put off again and again."""
+"""The longest pause between two detections, in usual pauses, where one is put off again and again."""
 
 _TURN_SHARE = 0.5
 """Of the time to the next picture a list waits for the detector, which other sessions use too."""
 _LATE_NS = SECOND_NS
-"""Tracks are followed for so long while the next picture that was to be searched is; after that they are old."""
+"""The longest time that tracks are followed while the detector is busy; after that they are old."""
 
 _HISTORY_S = 3.0
 """Of pictures that residual stills may build on."""
 _REACH_S = 4.0
-"""Of a stream that leaves out frames as many pictures reach back further, but for so long alone an edge sends its
-stills again."""
+"""The same number of pictures of a stream that leaves out frames reaches back further, but an edge sends its stills
+again only within this time."""
 _MOST_HISTORY_FRAMES = 45
 _MOST_HISTORY_BYTES = 128 * 2**20
 
@@ -102,7 +102,7 @@ class PerceptionCounts:
     """The counts of a `Pipeline`; the defaults are those of one that is not made yet."""
 
     tracks: int = 0
-    """Distinct tracks so far, whoever saw them."""
+    """Distinct tracks so far, of all sources."""
     refined: int = 0
     """Distinct tracks that a still has refined."""
     class_changes: int = 0

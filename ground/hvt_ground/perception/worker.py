@@ -41,9 +41,9 @@ _MOST_JOBS = 4096
 _MOST_LAST_JOBS = 8
 """Of those that come last: each holds a stretch of video."""
 _JOB_STEP_S = 0.1
-"""On a machine that never comes to rest jobs still get one step in so long."""
+"""On a machine that never comes to rest jobs still get one step in this time."""
 _STEP_LAG = 2
-"""In lockstep a step, or a pose, counts from so many frames on. It is sent right before the next access unit, which
+"""In lockstep a step, or a pose, counts from 2 frames on. It is sent right before the next access unit, which
 may overtake it by microseconds: this makes the order the same in every run."""
 _AHEAD = 2
 
@@ -335,11 +335,11 @@ class LockstepWorker(_Worker):
             self._submit(self._worker.submit(self._read, known))
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
-        """Take in a report of tracks before the frame that comes so many frames later."""
+        """Take in a report of tracks before the frame `_STEP_LAG` frames later."""
         self._steps.append((tracks, capture_ns))
 
     def pose(self, use: Callable[[], None], capture_ns: int) -> None:
-        """It counts from so many pictures on, like a report of tracks."""
+        """It counts from `_STEP_LAG` pictures on, like a report of tracks."""
         self._poses.append((capture_ns, use))
 
     def still(self, still: ReceivedStill) -> None:

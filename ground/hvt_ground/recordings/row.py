@@ -19,7 +19,7 @@ from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Sh
 from hvt_ground.poses import Locator, PoseTrail
 
 _MOST_REMEMBERED = 4096
-"""Tracks and stills that are known again; one that comes back after so many others counts twice."""
+"""The most tracks and stills that are known again; one that comes back after as many others counts twice."""
 _LATEST_NS = 2**63 - 1
 
 

@@ -31,7 +31,7 @@ _SMALL_BYTES, _MOST_SMALL = 128 * 2**10, 8
 """A file costs 190 kB beside its content. With less content the next one begins at most 8 times in a session, or once
 half its time has passed here, too: capture times are the edge's word."""
 _BEHIND_S = 3.0
-"""For so long a former file waits for perception."""
+"""The longest time that a former file waits for perception."""
 _MOST_LATE_OPEN, _MOST_LATE = 4, 32
 """Files of backlog beside former ones: each costs 80 kB before its first byte."""
 

@@ -26,9 +26,9 @@ LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 carry; ``lost``: nothing has come for `LOST_NS`; ``ended``: the edge said so, or stayed away."""
 
 LOST_NS = 3 * SECOND_NS
-"""A report comes once a second: nothing for so long is no accident."""
+"""A report comes once a second: a pause of three is no accident."""
 _THIN_S = 5.0
-"""So long after the last frame that the link did not carry it counts as thin."""
+"""The link counts as thin for this long after the last frame that it did not carry."""
 
 
 @dataclass(frozen=True, slots=True)

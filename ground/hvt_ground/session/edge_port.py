@@ -42,7 +42,7 @@ _MOST_REPORTS_PER_S = 100
 _ANSWER_S = 1.0
 _MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
-"""So many queries on control in a row without an answer are no accident."""
+"""Three queries on control in a row without an answer are no accident."""
 
 InfoAnswer = tuple[Info, int, int]
 """A session's facts with the times of asking and hearing, ns."""

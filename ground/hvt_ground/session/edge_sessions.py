@@ -42,11 +42,11 @@ _log = logging.getLogger(__name__)
 
 _INFO_TRIES = 3
 _BACKLOG_PAUSE_NS = 3 * SECOND_NS
-"""After so long without another chunk the recording says how much of the backlog came."""
+"""After a pause of chunks this long the recording says how much of the backlog came."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
 """Time between two queries of the edge's clock."""
 _BURST, _EVERY_NS = 30, 5 * SECOND_NS
-"""So many sessions begin at once, then one in so long: each is a file, and has a log of its own."""
+"""Up to 30 sessions begin at once, then one in 5 s: each is a file, and has a log of its own."""
 
 
 class EdgeSessions:

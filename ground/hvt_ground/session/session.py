@@ -316,7 +316,7 @@ class Session:
 
 
 _BURST, _EVERY_NS = 60, SECOND_NS
-"""So many at once, then one a second."""
+"""Up to 60 at once, then one a second."""
 
 
 class SessionLog:

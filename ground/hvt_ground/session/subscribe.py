@@ -28,7 +28,7 @@ token takes the place of one that has neither a token nor a session."""
 _MOST_SHARED = 16384
 """Edges of all members of a group together."""
 _QUIET_NS, _MOST_QUIET_NS = 2 * SECOND_NS, 64 * SECOND_NS
-"""So long an edge that is there may send nothing; the longest pause before its subscriptions are made again."""
+"""The time that a present edge may send nothing; the longest pause before its subscriptions are made again."""
 _SUBSCRIBED = (
     *(Channel.BASE, Channel.ROI, Channel.TRACKS),
     *(Channel.POSE, Channel.BACKLOG, Channel.STATUS),

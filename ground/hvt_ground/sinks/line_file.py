@@ -17,7 +17,7 @@ from hvt_ground.sinks.queued import SinkWriter
 def claim_name(path: Path) -> bool:
     """Whether the name was free: from now on it is ours, with an empty file, and no other process gets it.
 
-    True as well where no file can be made there; whoever opens it says why.
+    True as well where no file can be made there; opening it tells why.
     """
     try:
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))

@@ -47,7 +47,7 @@ class SinkWriter(ABC, Generic[T]):
     def log(self, item: T) -> None: ...
 
     def skipped(self, count: int) -> None:
-        """So many items were left out before the next one."""
+        """``count`` items were left out before the next one."""
 
     def close(self, hurry: threading.Event | None = None) -> None:
         """Write the rest; skip slow extras once ``hurry`` is set. A second call does nothing."""
@@ -94,7 +94,7 @@ class QueuedSink(Generic[T]):
         self._taken = 0
         """Items that ever were queued."""
         self._receipts: deque[tuple[int, Callable[[bool], None]]] = deque()
-        """The functions to call when so many of them are written."""
+        """The functions to call when this many items are written."""
         self._queued_bytes = 0
         self._skipped = 0
         self._in_hand = False
@@ -168,7 +168,7 @@ class QueuedSink(Generic[T]):
             return not (self._queue or self._in_hand)
 
     def is_open(self, *, within_s: float = 0.0) -> bool:
-        """Whether an item logged now will be written, as far as is known; waits so long for the sink to be made.
+        """Whether an item logged now will be written, as far as is known; waits ``within_s`` for the sink to be made.
 
         Not where half the queue is full: stored items can come later and leave the rest to live ones.
         """

@@ -172,7 +172,7 @@ class Kind:
     """
 
     text: str
-    """Whose it is, and the shape of its outputs."""
+    """The family of networks, and the shape of its outputs."""
     match: Callable[[Trial], Match | None]
     anchor: Anchor
     preparation: Preparation
@@ -197,7 +197,7 @@ class Kind:
 
 
 def tables(trial: Trial, columns: int | None = None) -> list[int]:
-    """Outputs (1, N, K), or (N, K) with so many columns."""
+    """Outputs (1, N, K) or (N, K), with K ``columns`` where given."""
     return [
         index
         for index in range(len(trial.ports))

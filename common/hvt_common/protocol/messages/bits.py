@@ -1,4 +1,4 @@
-"""Bit strings: fields of so many bits, and Exp-Golomb codes of order k, small numbers in few bits and any in some.
+"""Bit strings: fields of fixed width, and Exp-Golomb codes of order k, which code small numbers in few bits.
 
 A number from 0 up is ``0…0 1 s…s``: with ``q = number + 2^k`` of n bits, n - 1 - k zeros, then the n bits of ``q``
 (Teuhola 1978). A signed one is numbered 0, 1, -1, 2, -2 … before. Of order 0 they are those in headers of H.264 and
@@ -23,7 +23,7 @@ class BitWriter:
         self._text: list[str] = []
 
     def u(self, value: int, bits: int) -> BitWriter:
-        """``value`` in so many bits."""
+        """``value`` in ``bits`` bits."""
         if not 0 <= value < 1 << bits:
             raise ValueError(f"{value} is no number of {bits} bits")
         self._text.append(f"{value:0{bits}b}")

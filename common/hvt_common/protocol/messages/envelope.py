@@ -32,7 +32,7 @@ READ_VERSIONS = (4, 5)
 """Of stored messages: in logs, in recordings, and on an edge's disk."""
 MOST_VERSION = 255
 MOST_UNKNOWN_FIELDS = 16
-"""So many fields behind the last known one are skipped, in each array; with more it is no message of ours."""
+"""Up to this many fields behind the last known one are skipped, in each array; more are no message of ours."""
 DEEPEST = 8
 """Levels of arrays and maps, the message's own array counted."""
 

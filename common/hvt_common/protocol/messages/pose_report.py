@@ -19,7 +19,7 @@ _MOST_BYTES: Final = 48
 _MILLION: Final = 1_000_000
 _NUMBERS: Final = 16
 _MOST_PAUSE_NS: Final = 12_000_000_000
-"""No encoder goes on for so long without a report that stands by itself; sixteen reports take longer."""
+"""The longest time that an encoder goes on without a report that stands by itself; sixteen reports take longer."""
 _ONE_SECOND_MS: Final = 1000
 _TIME_BITS, _TIME_ORDER = 42, 4
 

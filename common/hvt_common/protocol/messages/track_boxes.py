@@ -22,7 +22,7 @@ MOST_BOXES: Final = 1024
 """Limit of one step."""
 MOST_CLASSES: Final = 2048
 PER_PX: Final = 16
-"""Positions and sizes count so many to a base pixel."""
+"""Positions and sizes are in sixteenths of a base pixel."""
 CONFIDENCE_STEPS: Final = 15
 
 _FAR: Final = 32_767 * PER_PX
@@ -30,13 +30,13 @@ _FAST: Final = 1 << 24
 _VELOCITY_BITS: Final = 8
 """A velocity counts 2^-8 of a position's count a frame."""
 _FINENESS: Final = 18
-"""A side has at least so many steps, and at most twice as many, when its track is first listed."""
+"""A side has 18 to 36 steps when its track is first listed."""
 _COARSEST: Final = 11
 _PATIENCE: Final = 6
-"""A track that is not listed is remembered for so many steps: it comes back cheaper than a new one."""
+"""Steps for which a track that is not listed is remembered: it comes back cheaper than a new one."""
 _SHARED_STEP: Final = 4
 _UNSURE: Final = 2
-"""A confidence is sent again when it is off by so many of its steps."""
+"""A confidence is sent again when it is off by 2 of its steps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +60,7 @@ class CodedTrack:
     """Steps since it was last listed; 0 for listed now."""
 
     def moved(self, frames: int) -> tuple[int, int]:
-        """The box so many frames later, at constant velocity."""
+        """The box ``frames`` later, at constant velocity."""
         half = 1 << _VELOCITY_BITS - 1
         return (
             self.x + (self.velocity_x * frames + half >> _VELOCITY_BITS),

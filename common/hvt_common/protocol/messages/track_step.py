@@ -75,7 +75,7 @@ class TrackStepEncoder:
         alone = self._fresh_ns is None or capture_ns - self._fresh_ns >= self._refresh_ns * _EARLY
         count = min(len(tracks), MOST_BOXES)
         data, state = self._coded(tracks, count, alone=alone, frames=frames)
-        while len(data) > _MOST_BOX_BYTES:  # only boxes that no tracker lists need so much
+        while len(data) > _MOST_BOX_BYTES:  # no list of a tracker needs as many bytes
             count //= 2
             data, state = self._coded(tracks, count, alone=alone, frames=frames)
         if alone:

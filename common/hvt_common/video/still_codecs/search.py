@@ -22,7 +22,7 @@ _BT601_BGR = np.array([[0.114, 0.587, 0.299]], np.float32)
 _WHOLE_DB, _WHOLE_SIZE = 28.0, 4.0
 """By how much fidelity in dB and the logarithm of the size rise from the least quality to the best: a first guess."""
 _GUESSES = 5
-"""After so many tries the range is halved: this crop does not rise evenly."""
+"""After this many tries the range is halved: the crop does not rise evenly."""
 
 
 def best_fitting(

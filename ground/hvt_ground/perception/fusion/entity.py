@@ -189,9 +189,9 @@ def _centre(box: _Floats) -> _Floats:
 
 
 NEAR_IOU = 0.1
-"""A box of the edge that overlaps ours by so much is no miss: of a small object two boxes overlap little."""
+"""The least IoU of a box of the edge that is no miss of ours: two boxes of a small object overlap little."""
 LET_GO_STEPS = 6
-"""An object once listed by the edge must be missed in so many steps in a row: a detection may fail."""
+"""An object once listed by the edge must be missed in 6 steps in a row: a detection may fail."""
 SURER = 0.1
 """An object that was suppressed must be surer by this than one that never was, or it would come and go."""
 

@@ -239,7 +239,7 @@ class Fusion:
     # Learning
 
     def _patience(self, gap: int) -> int:
-        # How long a step counts, in frames, if the one before it came so many frames earlier.
+        # How long a step counts, in frames, if the one before it came ``gap`` frames earlier.
         usual = self._usual_patience
         return usual if 2 * gap <= usual else min(2 * gap, max(usual, self._forget))
 

@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
 _MOST_SPOILT, _SPOILT_FRAMES = 32, 150
-"""After so many undecodable stills in so many frames the next are dropped unseen until the time is over."""
+"""After 32 undecodable stills in 150 frames the next are dropped unseen until those frames are over."""
 MAX_PENDING, MAX_PENDING_BYTES = 64, 16 * 2**20
 """Stills that wait for their base frame; beyond, the oldest is read without it."""
 

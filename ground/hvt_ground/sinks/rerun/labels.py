@@ -43,7 +43,7 @@ class Label:
 
 
 def points(count: float, width_px: int) -> float:
-    """Pixels of a picture of this width for so many points of the screen."""
+    """Pixels of a picture of this width for ``count`` points of the screen."""
     return count * width_px / _POINTS_WIDE
 
 

@@ -149,7 +149,7 @@ class Recorder(SinkWriter[Event]):
     def open_file(self, path: Path | None) -> RecordingFile:
         """Another file of the session, or its viewer: opened together they are shown as one.
 
-        Whoever opens one closes it, but for `file`.
+        Its caller closes it, but for `file`.
         """
         settings = self._settings
         screen = self._screen(path)

@@ -240,7 +240,7 @@ def _created(path: Path) -> int:
     for _ in range(_LOCK_TRIES):
         with telling(f"recording {path} cannot be created: "):
             file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        # Whoever looks through the folder removes empty files that nobody has locked: this one perhaps, just now.
+        # The index removes empty files that nobody has locked: this one perhaps, just now.
         if locked(file) and os.fstat(file).st_nlink:
             if os.fstat(file).st_size:
                 os.ftruncate(file, 0)  # not before: another ground may be writing it

@@ -133,7 +133,7 @@ class SizeLimit:
         """About, once compacted."""
 
     def has(self, size_bytes: int, *, ratio: float) -> bool:
-        """Whether the recording stays below ``ratio`` times the bytes received with so much more in it."""
+        """Whether the recording stays below ``ratio`` times the bytes received with ``size_bytes`` more in it."""
         allowed = ratio * self.received_bytes + FIXED_BYTES + _HEAD_START_BYTES
         return self.logged_bytes + size_bytes <= allowed
 
@@ -167,7 +167,7 @@ def _bytes(name: str, rows: Sequence[tuple[int, ...]]) -> Columns:
 
 
 def _labels(**values: Sequence[Sequence[Any]]) -> Columns:
-    # One component of points, so many in each row.
+    # One component of points, any number in each row.
     ((name, rows),) = values.items()
     columns = rr.Points2D.columns(**{name: list(chain.from_iterable(rows))})
     return columns.partition([len(row) for row in rows])
