@@ -106,7 +106,7 @@ class ModelSettings:
     """Settings of a model's run."""
 
     threads: int = 1
-    """CPU threads inside one operator, 1 or more: the caller's, and workers with the priority of the opening thread."""
+    """CPU threads inside one operator, 1 or more: the caller's, and workers of the priority of the opener."""
     provider: str = "cpu"
     """One of `hvt_common.inference.runtimes.providers.PROVIDERS`."""
 
