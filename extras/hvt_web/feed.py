@@ -43,14 +43,10 @@ class SessionFeed(SinkWriter[Event]):
             "edge": info.edge,
             "session": f"{info.session_id:08x}",
             "baseSize": info.base_size,
-            "sourceSize": info.source_size,
-            "viewScale": info.view_scale,
-            "viewOffset": info.view_offset_px,
             "fps": info.fps,
             "method": info.method,
             "pace": info.pace,
             "budget": info.budget_bps,
-            "software": info.software,
         }
         page.last = self._last
         hub.post(partial(hub.begin, page, session))
@@ -166,7 +162,6 @@ class SessionFeed(SinkWriter[Event]):
             stored=item.stored,
             unread=item.unread,
             doubted=item.doubted,
-            sure=item.sure,
             note=item.note,
         )
         self._hub.post(partial(self._hub.still, self._page, message, pictures))
@@ -177,36 +172,41 @@ def still_name(info: Info, still: Refinement) -> str:
     return f"{info.session_id & 0xFFFFFF:06x}-{still.still_sequence}"
 
 
+_UNKNOWN = ("total", "base", "budget", "method", "recording")
+_NO_SESSION: dict[str, Any] = {**dict.fromkeys(_UNKNOWN), "short": "", "why": [], "words": []}
+
+
 def state_message(state: GroundState) -> str:
     """The state of all edges, for the wall and the plot; the words that an operator reads are made here."""
-    failing = {part.part for part in state.failed}
-    edges = {
-        one.edge: {
-            "link": one.link,
-            "since": one.link_since_ns // _MILLION,
-            "total": None if one.session is None else one.session.total_bps,
-            "base": None if one.session is None else one.session.base_bps,
-            "budget": None if one.session is None else one.session.budget_bps,
-            "method": None if one.session is None else one.session.method,
-            "short": "" if one.session is None else _short(one, state.at_ns),
-            "recording": None
-            if one.session is None
-            else state.recorded and not failing & {f"recording of {one.edge}", "recording"},
-            "why": [] if one.session is None else _why(one.session),
-            "words": []
-            if one.session is None
-            else ["the detector is loading: boxes of this ground come then"] * state.loading
-            + _words(one.session, calibrated=state.calibrated),
-            "failed": [
-                *(_failure(part.part, part, state.at_ns) for part in one.failed),
-                *_edge_failures(one, state.at_ns),
-            ],
-        }
-        for one in state.edges
-    }
+    edges = {one.edge: _edge(one, state) for one in state.edges}
     elsewhere = {edge: {"member": one.member, "page": one.page} for edge, one in state.elsewhere.items()}
     failed = [_failure(part.part, part, state.at_ns) for part in state.failed]
     return text("state", at=state.at_ns // _MILLION, edges=edges, elsewhere=elsewhere, failed=failed)
+
+
+def _edge(one: EdgeState, state: GroundState) -> dict[str, Any]:
+    session, failed = one.session, [_failure(part.part, part, state.at_ns) for part in one.failed]
+    said = {"link": one.link, "since": one.link_since_ns // _MILLION, "failed": failed}
+    if session is None:
+        return said | _NO_SESSION
+    at_edge = [(part, _failure(part_words(part.part), part, state.at_ns)) for part in session.edge_failed]
+    failed += [f"at the edge: {words}" for _, words in at_edge]
+    short = [words for part, words in at_edge if part.part == "source"]
+    if session.total_bps is not None:
+        thin = "link or machine too slow, " if one.link == "thin" else ""
+        short.append(f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
+    unrecorded = {part.part for part in state.failed} & {f"recording of {one.edge}", "recording"}
+    loading = ["the detector is loading: boxes of this ground come then"] * state.loading
+    return said | {
+        "total": session.total_bps,
+        "base": session.base_bps,
+        "budget": session.budget_bps,
+        "method": session.method,
+        "short": ", ".join(short),
+        "recording": state.recorded and not unrecorded,
+        "why": _why(session),
+        "words": loading + _words(session, calibrated=state.calibrated),
+    }
 
 
 def state_loads(state: GroundState) -> dict[str, tuple[float, float, float, float]]:
@@ -250,19 +250,6 @@ def _some(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def _short(one: EdgeState, at_ns: int) -> str:
-    session = one.session
-    if session is None:
-        return ""
-    said = [
-        _failure(part_words(part.part), part, at_ns) for part in session.edge_failed if part.part == "source"
-    ]
-    if session.total_bps is not None:
-        thin = "link or machine too slow, " if one.link == "thin" else ""
-        said.append(f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
-    return ", ".join(said)
-
-
 def _why(session: SessionState) -> list[str]:
     why = [] if session.edge_frames is None else [f"At the edge {session.edge_frames}."]
     if session.stills_not_sent:
@@ -270,11 +257,6 @@ def _why(session: SessionState) -> list[str]:
     if session.still_outcomes:
         why.append(f"Of the objects in stills: {counts_text(session.still_outcomes)}.")
     return why + lever_sentences(session.levers)
-
-
-def _edge_failures(one: EdgeState, at_ns: int) -> list[str]:
-    failed = () if one.session is None else one.session.edge_failed
-    return [f"at the edge: {_failure(part_words(part.part), part, at_ns)}" for part in failed]
 
 
 def _failure(name: str, part: FailedPart, at_ns: int) -> str:

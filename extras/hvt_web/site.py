@@ -150,9 +150,6 @@ class Site:
         match message["type"]:
             case "watch":
                 edge = message["edge"]
-                if edge is None:
-                    self._hub.leave_edge(viewer)
-                    return
                 if message["rung"] not in RUNGS or not isinstance(edge, str):
                     raise ValueError("no rung")
                 self._hub.watch(viewer, edge, message["rung"])

@@ -51,8 +51,6 @@ class Viewer:
         self.address = address
         self.watches: tuple[str, Rung] | None = None
         self.wall = False
-        self.lost = 0
-        """Messages of video that it was too slow for."""
         self.hopeless = False
         """It takes nothing at all any more: nothing is kept for it, and `take` raises."""
         self.reason = ""
@@ -88,12 +86,10 @@ class Viewer:
     def put_video(self, message: str | bytes, *, begins: bool) -> None:
         """Queue a message of the live picture; ``begins``: it can be used without those before it."""
         if self.hopeless or (self._waits_for_keyframe and not begins):
-            self.lost += 1
             return
         if self._full:
             self._drop_video()
             if not begins:
-                self.lost += 1
                 self._waits_for_keyframe = True
                 return
         self._waits_for_keyframe = False
@@ -101,9 +97,7 @@ class Viewer:
 
     def put_picture(self, message: bytes) -> None:
         """Queue a thumbnail, which is no part of the live picture."""
-        if self.hopeless or self._full:
-            self.lost += 1
-        else:
+        if not (self.hopeless or self._full):
             self._add(message, video=True)
 
     def give_up(self, reason: str) -> None:
@@ -152,7 +146,6 @@ class Viewer:
 
     def _drop_video(self) -> None:
         others = [one for one in self._queue if not one[1]]
-        self.lost += len(self._queue) - len(others)
         self._begun = self._begun_bytes = 0
         self._queue = deque(others)
         self._bytes = sum(len(message) for message, _ in others)
@@ -338,12 +331,6 @@ class Hub:
             for message in (*edge.notices, *edge.stills):
                 viewer.put(message)
             self._join_stream(viewer, edge, rung)
-        self._want_all()
-
-    def leave_edge(self, viewer: Viewer) -> None:
-        viewer.leave_video()
-        self._put_thumbnails(viewer)
-        viewer.watches = None
         self._want_all()
 
     def show_wall(self, viewer: Viewer, *, shown: bool) -> None:

@@ -38,7 +38,7 @@ export class Connection {
   }
 
   open() {
-    const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
+    const socket = new WebSocket(new URL("ws", location.href.replace(/^http/, "ws")));
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     this.heard = performance.now();
@@ -83,7 +83,7 @@ export class Connection {
   /** A WebSocket that is refused tells no page why; the same question as a command is answered in words. */
   async askWhy() {
     try {
-      const reply = await fetch("/ws", { method: "POST" });
+      const reply = await fetch("ws", { method: "POST" });
       if ((reply.status === 401 || reply.status === 403) && !this.socket) this.onState("waiting", (this.why = (await reply.text()).slice(0, 300)));
     } catch {
       // there is no ground at all

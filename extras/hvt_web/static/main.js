@@ -5,7 +5,7 @@ import { Connection, unpacked } from "./connection.js";
 import { Player } from "./player.js";
 import { Plot } from "./plot.js";
 import { Stills } from "./stills.js";
-import { Wall, make } from "./wall.js";
+import { Wall, byNumber, make } from "./wall.js";
 import * as words from "./words.js";
 
 /** @typedef {import("./connection.js").Message} Message */
@@ -86,8 +86,8 @@ function onMessage(message, payload) {
       if (sessions.get(message.edge)?.session !== message.session) {
         wall.event(message.edge, ""); // it begins anew
         asked.delete(message.edge);
+        if (mine) forget(); // with other frames
       }
-      if (mine && sessions.get(chosen)?.session !== message.session) forget(); // with other frames
       sessions.set(message.edge, message);
       if (mine) describe();
       else if (!chosen) chooseFirst();
@@ -107,7 +107,7 @@ function onMessage(message, payload) {
       if (mine) addEvent(message);
       break;
     case "still":
-      if (mine) stills.add(/** @type {any} */ (message));
+      if (mine) stills.add(/** @type {any} */ ({ ...message, earlier: !message.id.startsWith(sessions.get(chosen)?.session.slice(2)) }));
       break;
     case "overlay":
       if (mine) boxes.add(/** @type {any} */ (message));
@@ -139,7 +139,7 @@ function onMessage(message, payload) {
 /** The one that the address names; where it names none, the first. */
 function chooseFirst() {
   const named = new URLSearchParams(location.hash.slice(1)).get("edge");
-  const [first] = [...sessions.keys()].sort();
+  const [first] = [...sessions.keys()].sort(byNumber);
   if (named && !sessions.has(named)) {
     by("absent").textContent = words.absentWords(named);
     by("absent").hidden = false;
@@ -176,6 +176,7 @@ function forget() {
   by("tracks").replaceChildren();
   by("classes").replaceChildren();
   boxes.left.clear();
+  stills.outdate();
   showAge();
   listTracks();
 }
@@ -337,13 +338,8 @@ function pressed(button) {
 
 // What is asked of the edge
 
-/**
- * What came of a command.
- * @param {string} said
- */
-function confirm(said) {
-  by("settings-text").textContent = said;
-}
+/** @param {string} said what came of a command */
+const confirm = (said) => (by("settings-text").textContent = said);
 
 /** @param {number[]} box @param {words.TrackFacts | null} track */
 async function pick(box, track) {
@@ -351,7 +347,7 @@ async function pick(box, track) {
   const edge = chosen;
   boxes.mark(box);
   tell(words.askingStill(edge, track), null);
-  const reply = await post(`/edges/${encodeURIComponent(edge)}/still`, { box, frame: shown.frame < 0 ? null : shown.frame });
+  const reply = await post(`edges/${encodeURIComponent(edge)}/still`, { box, frame: shown.frame < 0 ? null : shown.frame });
   boxes.mark(null);
   if (edge !== chosen) return;
   if (typeof reply === "string") {
@@ -393,7 +389,7 @@ async function keyframe() {
   const at = performance.now();
   keyframeAt = rungs[0] === "jpeg" ? 0 : at;
   confirm(words.ASKING_KEYFRAME);
-  const reply = await post(`/edges/${encodeURIComponent(edge)}/keyframe`, {});
+  const reply = await post(`edges/${encodeURIComponent(edge)}/keyframe`, {});
   if (edge !== chosen) return;
   if (typeof reply === "string") {
     keyframeAt = 0;
@@ -411,7 +407,7 @@ async function set(content, now) {
   if (role !== "operator" || !chosen) return;
   const edge = chosen;
   confirm(words.askingSetting(edge, now));
-  const reply = await post(`/edges/${encodeURIComponent(edge)}/settings`, content);
+  const reply = await post(`edges/${encodeURIComponent(edge)}/settings`, content);
   if (typeof reply !== "string") asked.set(edge, now);
   if (edge !== chosen) return;
   confirm(typeof reply === "string" ? reply : words.agreedSetting(edge, now));

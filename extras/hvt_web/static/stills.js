@@ -7,7 +7,8 @@ const MOST = 60;
 
 /** @typedef {{id: string, edge: string, frame: number, captured: number, shows: string[], track: number | null,
  *    before: string, after: string, sureness: number, reason: string, why: string, stored: boolean, unread: boolean,
- *    doubted: boolean, note: string, box: number[], crop: number[] | null}} Still x1, y1, x2, y2 in base pixels */
+ *    doubted: boolean, note: string, earlier?: boolean, box: number[], crop: number[] | null}} Still x1, y1, x2, y2 in
+ *    base pixels */
 
 export class Stills {
   /** @param {HTMLElement} list @param {HTMLDialogElement} large */
@@ -19,6 +20,8 @@ export class Stills {
      * @type {Still[]}
      */
     this.pending = [];
+    /** @type {Still[]} */
+    this.known = [];
     this.pointed = false;
     list.addEventListener("pointerenter", (event) => {
       this.pointed = event.pointerType === "mouse";
@@ -31,14 +34,21 @@ export class Stills {
   }
 
   reset() {
-    this.pending = [];
+    this.pending = this.known = [];
     this.list.replaceChildren();
+  }
+
+  /** Another flight begins, whose tracks have the same numbers. */
+  outdate() {
+    const known = this.known.map((still) => ({ ...still, earlier: true }));
+    this.reset();
+    for (const still of (this.known = known)) this.show(still);
   }
 
   /** @param {Still} still */
   add(still) {
-    this.pending.push(still);
-    if (this.pending.length > MOST) this.pending.shift();
+    this.known = [...this.known.slice(1 - 2 * MOST), still];
+    this.pending = [...this.pending.slice(1 - MOST), still];
     this.showPending();
   }
 
@@ -121,4 +131,4 @@ function outline({ box: [x, y, right, bottom] }, frame) {
 }
 
 /** @param {Still} still @param {string} which */
-const address = (still, which) => `/stills/${encodeURIComponent(still.edge)}/${still.id}/${which}`;
+const address = (still, which) => `stills/${encodeURIComponent(still.edge)}/${still.id}/${which}`;

@@ -43,8 +43,11 @@ export class Wall {
     const card = { button, picture, light, state, bar, last, age, captured: 0, link: "" };
     this.cards.set(edge, card);
     this.nobody.hidden = true;
-    const after = [...this.cards.keys()].sort();
+    const after = [...this.cards.keys()].sort(byNumber);
+    const marked = /** @type {HTMLElement | null} */ (this.root.querySelector("[aria-current=true]"));
+    const before = marked?.offsetLeft ?? 0;
     this.root.insertBefore(button, this.cards.get(after[after.indexOf(edge) + 1])?.button ?? null);
+    if (marked) this.root.scrollLeft += marked.offsetLeft - before; // else it would leave the screen
     return card;
   }
 
@@ -136,6 +139,8 @@ export class Wall {
     this.cards.get(chosen)?.button.scrollIntoView({ block: "nearest", inline: "nearest" });
   }
 }
+
+export const byNumber = new Intl.Collator("en", { numeric: true }).compare; // uav-2, uav-10
 
 /** @param {string} kind @param {string} name @param {Element} into @returns {any} */
 export function make(kind, name, into) {

@@ -9,7 +9,7 @@
  * one of this edge, wherever it is shown.
  */
 /** @typedef {{track: number | null, before: string, after: string, sureness: number, reason: string, why: string,
- *    stored: boolean, unread: boolean, doubted: boolean, note: string}} StillFacts */
+ *    stored: boolean, unread: boolean, doubted: boolean, note: string, earlier?: boolean}} StillFacts */
 /** @typedef {{name: string, id: number, sureness: number, doubted?: 1}} TrackFacts */
 
 /** @type {Record<string, string>} */
@@ -203,7 +203,7 @@ export const trackLabel = (track) => `${track.name}, track ${track.id}${track.do
 /** @param {StillFacts} still */
 export function stillWords(still) {
   if (still.track === null && still.reason === "asked") return "a closer look"; // of a place, whatever is there
-  const track = still.track === null ? "" : `track ${still.track}: `;
+  const track = still.track === null ? "" : `track ${still.track}${still.earlier ? " of the flight before" : ""}: `;
   if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
   const sure = percent(still.sureness);
   if (still.doubted) return `${track}doubted, ${still.before === still.after ? `${still.after} at ${sure}` : `was ${still.before}`}`;

@@ -65,7 +65,6 @@ def test_who_joins_long_after_a_keyframe_begins_there_too(hub):
     hub.watch(viewer, "uav-1", "h264")
     hub.made(edge, fragment(900), frame_index=900, captured_ms=0)
     assert kinds(viewer)[4:] == [f"fragment {number}" for number in range(901)]
-    assert viewer.lost == 0
 
 
 def test_who_joins_where_the_keyframe_is_no_longer_kept_waits_for_the_next(hub):
@@ -93,8 +92,6 @@ def test_a_slow_viewer_goes_on_at_a_keyframe_and_loses_no_words(hub):
         if number % 100 == 99:
             assert len([one for one in kinds(quick) if one.startswith("fragment")]) >= 99
     came = kinds(slow)
-    assert slow.lost > 500
-    assert quick.lost == 0
     assert came.count("notice") == 2
     frames = [int(one.split()[1]) for one in came if one.startswith("fragment")]
     assert len(frames) < 450
@@ -130,10 +127,11 @@ def test_nothing_is_made_for_nobody(hub):
     hub.leave(other)
     assert set(edge.wanted) == {"h264"}
     first = edge.wanted["h264"]
-    hub.leave_edge(viewer)
+    hub.leave(viewer)
+    hub.join(viewer)
     hub.watch(viewer, "uav-1", "h264")
     assert edge.wanted["h264"] != first, "a stream that nobody saw the start of would go on"
-    hub.leave_edge(viewer)
+    hub.leave(viewer)
     assert not edge.wanted
 
 
@@ -239,7 +237,8 @@ def test_who_looks_again_at_an_edge_that_goes_on_sees_nothing_old(hub):
     hub.join(viewer)
     hub.watch(viewer, "uav-1", "h264")
     assert "fragment 0" in kinds(viewer), "of a stream that goes on the last keyframe"
-    hub.leave_edge(viewer)
+    hub.leave(viewer)
+    hub.join(viewer)
     hub.watch(viewer, "uav-1", "h264")
     hub.made(edge, fragment(3), frame_index=3, captured_ms=0)  # on its way when nobody looked any more
     assert not {"start", "fragment 3"} & set(kinds(viewer))
