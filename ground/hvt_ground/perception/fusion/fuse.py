@@ -347,19 +347,13 @@ class Fusion:
         survivor, merged = (
             (theirs, ours) if theirs.id and (not ours.id or theirs.id < ours.id) else (ours, theirs)
         )
-        survivor.born, survivor.last_frame = (
-            min(survivor.born, merged.born),
-            max(survivor.last_frame, merged.last_frame),
-        )
+        survivor.born = min(survivor.born, merged.born)
+        survivor.last_frame = max(survivor.last_frame, merged.last_frame)
         survivor.still_frame = max(survivor.still_frame, merged.still_frame)
         survivor.own_id, survivor.own_vote, survivor.correction = ours.own_id, ours.own_vote, ours.correction
         survivor.own_then = ours.own_then
-        survivor.edge_id, survivor.edge_vote, survivor.reported = (
-            theirs.edge_id,
-            theirs.edge_vote,
-            theirs.reported,
-        )
-        survivor.missed, survivor.apart = theirs.missed, 0
+        survivor.edge_id, survivor.edge_vote = theirs.edge_id, theirs.edge_vote
+        survivor.reported, survivor.missed, survivor.apart = theirs.reported, theirs.missed, 0
         survivor.unlisted, survivor.is_doubted = 0, False
         if survivor.own_id is not None:
             self._by_own[survivor.own_id] = survivor

@@ -100,9 +100,8 @@ class Matcher:
     def __init__(self, *, least_iou: float, owned_frames: int) -> None:
         self._iou = least_iou
         self._owned_frames = owned_frames
-        self._ground_of: OrderedDict[int, tuple[int, int]] = (
-            OrderedDict()
-        )  # edge track → (ground track, frame)
+        self._ground_of: OrderedDict[int, tuple[int, int]] = OrderedDict()
+        # edge track → (ground track, frame)
         self._edge_of: OrderedDict[int, tuple[int, int]] = OrderedDict()  # ground track → (edge track, frame)
         self._claims: OrderedDict[int, dict[int, int]] = OrderedDict()  # frame → ground track → edge track
 
@@ -222,12 +221,10 @@ class Matcher:
 
 
 def _by_edge_track(wanted: Sequence[StillSeen]) -> list[list[StillSeen]]:
-    groups: dict[tuple[str, Hashable], list[StillSeen]] = {}
+    groups: dict[Hashable, list[StillSeen]] = {}
     for want in wanted:
-        of_track = want.event.edge_track_id >= 0
-        groups.setdefault(
-            ("track", want.event.edge_track_id) if of_track else ("still", want.key), []
-        ).append(want)
+        edge_id = want.event.edge_track_id
+        groups.setdefault(edge_id if edge_id >= 0 else want.key, []).append(want)
     return list(groups.values())
 
 

@@ -60,15 +60,17 @@ class ClassEstimate:
 class TrackPosterior:
     """The class posterior of one track of the ground."""
 
-    __slots__ = ("_clear", "_log_sum", "_newest", "_order", "last_frame")
+    __slots__ = ("_clear", "_log_sum", "_newest", "_order", "base_class_id", "last_frame")
 
     def __init__(self, frame_index: int) -> None:
         self.last_frame = frame_index
         """The newest frame in which the track was there."""
+        self.base_class_id = -1
+        """Its class on the base in the frame of the newest still."""
         self._newest: Posterior | None = None
         self._clear = False
         self._order = (-1, -1)
-        self._log_sum: npt.NDArray[np.int64] | None = None
+        self._log_sum = np.zeros((), np.int64)
 
     def update(self, said: Posterior, *, order: tuple[int, int], side_px: float, news: float = 1.0) -> bool:
         """Take a still's vote; True if it is the newest so far by ``order`` (frame index, sequence).
@@ -77,7 +79,7 @@ class TrackPosterior:
         """
         logs = np.log(np.clip(said.probabilities.astype(np.float64), PROBABILITY_FLOOR, 1.0))
         units = np.rint(logs * news * _UNITS_PER_NAT).astype(np.int64)
-        self._log_sum = units if self._log_sum is None else self._log_sum + units
+        self._log_sum = self._log_sum + units
         if order < self._order:
             return False
         self._order, self._newest, self._clear = order, said, side_px >= LEAST_SURE_PX
@@ -97,7 +99,6 @@ class TrackPosterior:
         """All stills together with the detector's present vote (its class and confidence on the base)."""
         said = self._newest
         assert said is not None, "update() comes first"
-        assert self._log_sum is not None, "set with it"
         logs = self._log_sum / _UNITS_PER_NAT
         logs += BASE_WEIGHT * _base_log_vote(vocabulary, class_id=class_id, confidence=confidence)
         logs -= logs.max()

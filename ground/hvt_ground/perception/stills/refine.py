@@ -76,9 +76,8 @@ class Refiner:
         self._held: dict[tuple[int, int], tuple[StillSeen, int]] = {}
         """By still sequence and part, oldest offer first; each waits no longer once the stream is past the frame."""
         self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
-        self._track_posteriors: OrderedDict[int, TrackPosterior] = (
-            OrderedDict()
-        )  # by ground track id, longest unseen first
+        self._track_posteriors: OrderedDict[int, TrackPosterior] = OrderedDict()
+        """By ground track id, longest unseen first."""
 
     def offer(self, still: StillSeen, *, now_frame: int) -> list[StillSeen]:
         """Take a still; returns stills that had to make room for it (almost always none).
@@ -132,9 +131,11 @@ class Refiner:
 
     def shown(self, tracks: Tracks, *, capture_ns: int = 0, origins: tuple[Origin, ...] = ()) -> Overlay:
         """The tracks of one frame with the classes to show; frames must not go back."""
-        for track_id in tracks.ids.tolist():
+        for row, track_id in enumerate(tracks.ids.tolist()):
             class_posterior = self._track_posteriors.get(track_id)
-            if class_posterior is not None:
+            if class_posterior is not None and self._is_of_another(class_posterior, tracks, row):
+                del self._track_posteriors[track_id]
+            elif class_posterior is not None:
                 self._touch(track_id, class_posterior, tracks.frame_index)
         self._forget(tracks.frame_index)
         return self.preview(tracks, capture_ns=capture_ns, origins=origins)
@@ -259,6 +260,8 @@ class Refiner:
             side_px=still.side_px,
             news=still.news,
         )
+        if newest:
+            class_posterior.base_class_id = int(tracks.class_ids[row])
         self._touch(track_id, class_posterior, still.event.shown_at[0])
         after = self._read(class_posterior, tracks, row)
         self.class_changes += after.class_id != before.class_id
@@ -293,6 +296,13 @@ class Refiner:
         return class_posterior.fused(
             self._vocabulary, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
         )
+
+    def _is_of_another(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> bool:
+        # The tracker asks for no class: a person who takes the place of a car has its track, and would have its name.
+        names, now = self._vocabulary.names, self._vocabulary.names[tracks.class_ids[row]]
+        if not are_apart(now, names[class_posterior.base_class_id]):
+            return False
+        return are_apart(now, names[self._read(class_posterior, tracks, row).class_id])
 
     def _is_doubted(self, reading: ClassEstimate, base_class: str) -> bool:
         contradicts = are_apart(base_class, self._vocabulary.names[reading.class_id])

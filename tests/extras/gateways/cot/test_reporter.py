@@ -187,6 +187,7 @@ def test_remarks_say_what_is_known_and_where_the_still_is():
     rig = Rig()
     rig.says(still(1))
     rig.says(still(None, 4))
+    rig.says(still(2, 5))  # of what was there before, whose name it had
     rig.says(still(1, 2, stored=True))
     first, second = rig.says(
         overlay(classes=("truck", "car"), refined=np.array([True, False]), sure=np.array([True, False]))
@@ -284,7 +285,7 @@ def test_a_flood_of_stills_and_tracks_fills_no_memory():
     rig = Rig()
     for number in range(20_000):
         rig.says(still(number))
-    rig.says(overlay(ids=(1, 19_999)))
+    rig.says(overlay(ids=(1, 19_999), refined=np.ones(2, bool)))
     first, last = (ET.fromstring(one.data) for one in rig.sent)
     assert "url" not in first.find("detail/link").attrib
     assert "url" in last.find("detail/link").attrib

@@ -319,6 +319,19 @@ def test_a_track_that_ended_is_forgotten(ground):
     assert not ground.refiner.shown(tracks(452, {1: A})).refined.any()
 
 
+@pytest.mark.parametrize(("base_then", "shown"), [(2, [2, 1]), (1, [2, 2])])
+def test_who_takes_the_place_of_what_a_still_named_does_not_take_its_name(base_then, shown):
+    """A car that stopped where a person had stood had the person's track, name and check mark."""
+    ground = Ground("fuse", calibrated=True)
+    ground.track(5, {1: A}, classes={1: base_then})
+    ground.offer(still(0, 5, posterior=says(0.98, 0.01, 0.01)))
+    names = [
+        ground.refiner.shown(tracks(frame, {1: A}, classes={1: base}, confidences={1: 0.9})).classes
+        for frame, base in ((6, 2), (60, 1))
+    ]
+    assert names == [(DETECTOR[one],) for one in shown], "a still that was right of a van stays so"
+
+
 def test_a_flood_of_stills_is_bounded_and_given_out():
     """Anyone who can send a packet could fill the ground's memory."""
     ground = Ground()
