@@ -57,6 +57,8 @@ _OLD_GAPS: Final = 2
 _MOST_PICTURES: Final = 24
 """Kept while one of them is being searched: the objects found there are carried through all later ones."""
 
+_USUAL_STEP_S: Final = 1 / 15
+"""From frame to frame. Where a camera gives fewer, as much is unseen between two as between two that are searched."""
 _MOST_GROWTH: Final = 0.75
 """Box lengths; wider, and neighbours in a queue of cars are taken for each other."""
 
@@ -168,7 +170,7 @@ class ByteTracker:
         self._gaps.append(gap)
         self._mark_over_time(frame_index)
         self._table = self._table.widened(1 + int(np.maximum.reduce(seen.class_ids, initial=-1)))
-        growth = self._growth(gap - 1)
+        growth = self._growth(gap)
         held = self._held(frame_index) if growth and self._is_slow else None
         found = match(self._table, seen, self._settings, growth=growth, held=held)
         self._steady = self._steady + 1 if found.as_predicted else 0
@@ -265,10 +267,11 @@ class ByteTracker:
             stale = (table.seen[late] < oldest - 1) & (table.since[late] != self._updated_index)
             self._table = table.take(np.delete(np.arange(len(table)), late[stale]))
 
-    def _growth(self, unsearched: int) -> float:
+    def _growth(self, gap: int) -> float:
         # Before its second detection a track has no velocity, and a small object leaves its own box: never confirmed.
         # Larger boxes are of C-BIoU (Yang et al., WACV 2023); at the first match they mix up dense crowds.
-        return min(_MOST_GROWTH, self._settings.search_growth_per_s * unsearched / self._fps)
+        unsearched_s = gap / self._fps - min(1 / self._fps, _USUAL_STEP_S)
+        return min(_MOST_GROWTH, self._settings.search_growth_per_s * unsearched_s)
 
     def _held(self, frame_index: int) -> _Floats:
         # The last boxes, moved with the camera alone: meanwhile a vehicle may have stopped.

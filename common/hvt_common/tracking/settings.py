@@ -30,8 +30,8 @@ class TrackerSettings:
     """Tracks whose box is not larger than this are not listed."""
     search_growth_per_s: float = 3.0
     """After frames without detection, the rest is matched once more with boxes larger on every side, by this many
-    of their own lengths for a second without (0.75 at most). Where every frame is searched nothing
-    changes; 0 is off."""
+    of their own lengths for a second without (0.75 at most). Where every frame of 15 a second is
+    searched nothing changes; 0 is off."""
     class_decay: float = 0.9
     """The remaining weight of a class vote one matched detection later: 1 never forgets."""
     camera_motion: Literal["off", "flow"] = "off"

@@ -272,15 +272,17 @@ def test_predicted_frames_carry_tracks_on_and_lose_none() -> None:
     )  # frame 29 at 4 px a frame
 
 
-def test_a_small_fast_object_is_confirmed_between_rare_detections() -> None:
-    """From a drone, a car that leaves its own box within five frames would never become a track."""
+@pytest.mark.parametrize(("fps", "every"), [(15, 5), (3, 1)])
+def test_a_small_fast_object_is_confirmed_between_rare_detections(fps: float, every: int) -> None:
+    """A car that leaves its own box in a third of a second never became a track, of a camera of 3 fps above all."""
     cars = [(100 + 4.5 * k, 100, 118 + 4.5 * k, 112) for k in range(0, 26, 5)]
     found = {}
     for growth in (0.0, 3.0):
-        tracker = ByteTracker(TrackerSettings(search_growth_per_s=growth), fps=15)
+        tracker = ByteTracker(TrackerSettings(search_growth_per_s=growth), fps=fps)
         tracker.update(Detections.none(), frame_index=0)
         ids = [
-            tracker.update(seen(car), frame_index=5 * k).ids.tolist() for k, car in enumerate(cars, start=1)
+            tracker.update(seen(car), frame_index=every * k).ids.tolist()
+            for k, car in enumerate(cars, start=1)
         ]
         found[growth] = ids
     assert found[0.0] == [[], [], [], [], [], []]
