@@ -123,9 +123,7 @@ def _list(_: argparse.Namespace) -> int:
 
 def _fetch(arguments: argparse.Namespace) -> int:
     store = Store()
-    entries = [
-        store.entry(name) for name in arguments.names
-    ]  # a wrong name is said before anything is fetched
+    entries = list(map(store.entry, arguments.names))  # a wrong name is said before anything is fetched
     console = Console(stderr=True, highlight=False)
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     for entry in entries:

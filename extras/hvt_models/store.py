@@ -18,6 +18,7 @@ from typing import Any
 
 from hvt_common.errors import UserError, named_path, telling
 from hvt_common.files import read_text
+from hvt_common.inference.store import MOTION, embedded_models
 from hvt_models.manifest import (
     MAX_SIZE_BYTES,
     ModelEntry,
@@ -66,6 +67,7 @@ class Store:
         """The entry of this name; `UserError` with near names where there is none."""
         entries = self.entries
         if name not in entries:
+            _check_free(name)
             near = difflib.get_close_matches(name, entries, n=2) or sorted(entries)
             raise UserError(f"model '{name}' is not known: did you mean {' or '.join(near)}?")
         return entries[name]
@@ -176,7 +178,7 @@ class Store:
         both by a comma, and pins it; for a built-in name it must agree with the manifest. Raises `UserError` for
         another file than pinned, a missing pin, or a folder that cannot be written.
         """
-        check_name(name)
+        _check_free(check_name(name))
         brought = (file, file.with_suffix(".bin")) if file.suffix.lower() == ".xml" else (file,)
         given = () if sha256 is None else tuple(check_digest(one.strip()) for one in sha256.split(","))
         pins = [_pin_of(one) for one in brought]
@@ -267,6 +269,11 @@ class Store:
         if not entry.urls:
             return _by_hand(entry)
         return f"run 'hvt-models fetch {entry.name}' ({entry.total_bytes / 1e6:.1f} MB); {_by_hand(entry)}"
+
+
+def _check_free(name: str) -> None:
+    if name in (*embedded_models(), MOTION, "none", "detector"):  # the programs' own words
+        raise UserError(f"model name '{name}' is HVT's own: there is nothing to fetch, verify or add")
 
 
 def _by_hand(entry: ModelEntry) -> str:

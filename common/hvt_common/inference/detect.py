@@ -200,6 +200,9 @@ class OnnxDetector:
             self.head = choose_head(trial, wanted=head)
         except UserError as error:
             raise UserError(_not_a_detector(model, str(error), channels_last=self._channels_last)) from None
+        if any(model.outputs[index].dtype in (np.int8, np.uint8) for index in self.head.outputs):
+            why = "its answer is 8-bit numbers without their scale: end its graph with DequantizeLinear"
+            raise UserError(_not_a_detector(model, why))
         usual = self.head.preparation.beside(own_steps(model.path))
         dtype = model.inputs[0].dtype
         assert dtype is not None
@@ -408,12 +411,10 @@ def _group_ids(class_names: tuple[str, ...]) -> npt.NDArray[np.int32]:
 def _geometry(model: OnnxModel) -> tuple[bool, tuple[int | None, int | None]]:
     # Whether channels come last, and the (width, height) that the file declares, None where free.
     image, *more = model.inputs
-    if len(image.shape) != 4 or (3 not in (image.shape[1], image.shape[3]) and image.shape[1] is not None):
-        raise UserError(_not_a_detector(model, "its input is not one (1, 3, height, width) image"))
-    if len(more) > 1 or any(one.shape[1:] != (2,) or one.dtype is None for one in more):
-        raise UserError(
-            _not_a_detector(model, "its input is not one (1, 3, height, width) image, or that and its size")
-        )
+    one = len(image.shape) == 4 and (3 in (image.shape[1], image.shape[3]) or image.shape[1] is None)
+    if not one or len(more) > 1 or any(port.shape[1:] != (2,) or port.dtype is None for port in more):
+        why = "its input is not one (1, 3, height, width) image, or that and its size"
+        raise UserError(_not_a_detector(model, why))
     if more and "scale" in more[0].name.lower():
         what = f"its second input {more[0].name!r} is no size of the picture: export it without"
         raise UserError(_not_a_detector(model, what))

@@ -23,9 +23,7 @@ class _RetriedModel(Retried[_Model], Generic[_Model]):
     ) -> None:
         begun: list[tuple[str, ...]] = []
 
-        def open_same() -> (
-            _Model
-        ):  # it does not hold this object: a session's model would outlast the session
+        def open_same() -> _Model:  # it does not hold this object: a model would outlast its session
             part = open_part()
             if not begun:
                 begun.append(part.class_names)

@@ -119,9 +119,8 @@ def fuse(
         merged[place] += (boxes[row] - merged[place]) * (weight / weights[place])
         votes[place, kind] += sure[row] * (_VAGUE_VOTE if vague[kind] else 1)
     ids = votes[:count].argmax(axis=1).astype(np.int32)
-    count = min(
-        count, MAX_DETECTIONS
-    )  # a cluster begins with its surest box, and the surest cluster comes first
+    # A cluster begins with its surest box, and the surest cluster comes first.
+    count = min(count, MAX_DETECTIONS)
     return Detections(merged[:count].astype(np.float32), best[:count], ids[:count])
 
 

@@ -460,6 +460,7 @@ def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path: Path) -> None:
         "two heads": constant_model(tmp_path / "t.onnx", scores, empty(9, 84)),
         "logits": constant_model(tmp_path / "l.onnx", scores - 5),
         "masks": constant_model(tmp_path / "s.onnx", scores, metadata={"task": "segment"}),
+        "8 bits": constant_model(tmp_path / "q.onnx", scores, dtype=np.uint8),  # each score was 0
     }
     for path in models.values():
         with pytest.raises(

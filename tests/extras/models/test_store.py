@@ -382,6 +382,9 @@ def test_a_file_brought_by_hand_is_taken_in_if_its_digest_is_right(
     assert "is pinned for yolox-s" in capsys.readouterr().err
     assert main(["add", str(file), "--name", "Mine", "--sha256", digest]) == 2
     assert "model name 'Mine' is not accepted" in capsys.readouterr().err
+    for taken in ("aerial-nano", "motion", "none"):  # --detector and --classifier would never mean this file
+        assert main(["add", str(file), "--name", taken, "--sha256", digest]) == 2
+        assert f"model name '{taken}' is HVT's own" in capsys.readouterr().err
     assert main(["add", str(tmp_path / "none"), "--name", "mine", "--sha256", digest]) == 2
     assert "cannot be read (No such file" in capsys.readouterr().err
     assert not (folder / "mine.onnx").exists()

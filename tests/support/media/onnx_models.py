@@ -31,7 +31,7 @@ def save(
     dtype: type = np.float32,
 ) -> Path:
     """Write a checked model of these nodes and return its path."""
-    element = TensorProto.FLOAT16 if dtype is np.float16 else TensorProto.FLOAT
+    element = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
     ports = [
         [helper.make_tensor_value_info(name, element, shape) for name, shape in group.items()]
         for group in (inputs, outputs)
@@ -80,6 +80,7 @@ def constant_model(
     *outputs: np.ndarray,
     size: tuple[int, int] = (64, 64),
     metadata: Mapping[str, str] | None = None,
+    dtype: type = np.float32,
 ) -> Path:
     """A model that answers every (1, 3, height, width) image with the same arrays; ``size`` is (width, height)."""
     names = [f"output{index}" for index in range(len(outputs))]
@@ -88,8 +89,9 @@ def constant_model(
         [helper.make_node("Identity", [f"c_{name}"], [name]) for name in names],
         inputs={"images": (1, 3, size[1], size[0])},
         outputs={name: value.shape for name, value in zip(names, outputs, strict=True)},
-        constants={f"c_{name}": value.astype(np.float32) for name, value in zip(names, outputs, strict=True)},
+        constants={f"c_{name}": value.astype(dtype) for name, value in zip(names, outputs, strict=True)},
         metadata=metadata,
+        dtype=dtype,
     )
 
 

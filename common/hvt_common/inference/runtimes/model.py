@@ -56,14 +56,6 @@ _WORTH_SHARE = 0.8
 LIGHT_BYTES = 8_000_000
 """A smaller file is a light network: the embedded ones, YOLOX-nano. OpenVINO alone takes more memory than it."""
 
-_ELEMENT_TYPES: Mapping[str, npt.DTypeLike] = {
-    "tensor(float)": np.float32,
-    "tensor(float16)": np.float16,
-    "tensor(double)": np.float64,
-    "tensor(uint8)": np.uint8,
-    "tensor(int32)": np.int32,
-    "tensor(int64)": np.int64,
-}
 _ORT_ERRORS = (
     *("EPFail", "EngineError", "Fail", "InvalidArgument", "InvalidGraph", "InvalidProtobuf", "ModelLoaded"),
     *("NoModel", "NoSuchFile", "NotImplemented", "RuntimeException"),
@@ -123,7 +115,7 @@ class Port:
 
     def __str__(self) -> str:
         sizes = ", ".join("?" if size is None else str(size) for size in self.shape)
-        return f"{self.name} ({sizes}) {self.dtype if self.dtype is not None else 'not a tensor'}"
+        return f"{self.name} ({sizes}) {self.dtype if self.dtype is not None else 'of a type not known here'}"
 
 
 class _Runner(Protocol):
@@ -346,9 +338,13 @@ def _check_ports(path: Path, inputs: tuple[Port, ...], outputs: tuple[Port, ...]
 
 
 def _port(value: Any) -> Port:
-    element = _ELEMENT_TYPES.get(value.type)
+    element = value.type.removeprefix("tensor(").rstrip(")")
+    try:
+        dtype = np.dtype("float32" if element == "float" else element)
+    except TypeError:  # text, or numbers that NumPy does not have, as bfloat16
+        dtype = None
     shape = tuple(size if isinstance(size, int) and size > 0 else None for size in value.shape or ())
-    return Port(value.name, shape, None if element is None else np.dtype(element))
+    return Port(value.name, shape, dtype)
 
 
 def _cause(path: Path, error: Exception) -> str:

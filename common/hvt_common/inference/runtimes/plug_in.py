@@ -12,12 +12,13 @@ from importlib.metadata import EntryPoint
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.errors import FOREIGN, UserError
 from hvt_common.inference.letterbox import as_bgr
 from hvt_common.inference.nms import MAX_DETECTIONS
 from hvt_common.runtime.plug_ins import installed, loaded, origin, the_one
-from hvt_common.values import Detections, Image
+from hvt_common.values import Boxes, Detections, Image
 
 _GROUP = "hvt.detectors"
 _WHAT = "detector"
@@ -76,13 +77,7 @@ class PlugInDetector:
         return Detections(boxes[best], sure[best], kinds[best])
 
 
-def _checked(
-    found: Any, *, classes: int
-) -> tuple[
-    np.ndarray[Any, np.dtype[np.float32]],
-    np.ndarray[Any, np.dtype[np.float32]],
-    np.ndarray[Any, np.dtype[np.int32]],
-]:
+def _checked(found: Any, *, classes: int) -> tuple[Boxes, npt.NDArray[np.float32], npt.NDArray[np.int32]]:
     if not isinstance(found, Detections):
         raise ValueError(f"detect gave {type(found).__name__}, and has to give Detections")  # noqa: TRY004
     boxes = np.asarray(found.boxes_xyxy_px, np.float32)
