@@ -278,9 +278,9 @@ def _read(path: Path, spool: Spool, number: int) -> _File:
                     spooled.add(*row)
             else:
                 rows.setdefault((entity, component), []).extend(found)  # type: ignore[arg-type]
-    for everything in rows.values():
+    for (_, component), everything in rows.items():
         if isinstance(everything, SpooledRows):
-            everything.sort()
+            everything.sort(unique=component == _SAMPLE)
         else:
             everything.sort(key=lambda row: row[0])
     return _File(id_of(reader), rows, ours=ours)
@@ -359,13 +359,15 @@ def _stills(rows: _Rows) -> Sequence[RecordedStill]:
             if isinstance(base, SpooledRows)
             else {}
         )
+        # A power cut may leave the append log behind the chunks that say the same: each picture counts once.
+        places = {(frame, hash(jpeg)): place for place, (frame, _, jpeg) in enumerate(pictures)}
         # Off the screen several may come at one frame, and nothing says which base crop is whose.
-        several = Counter(pictures.frames)
-        for place, (frame, _, jpeg) in enumerate(pictures):
+        several = Counter(frame for frame, _ in places)
+        for (frame, _), place in places.items():
             crop = crops.get(frame) if several[frame] == 1 else None
-            caption, header = str(captions.get(frame, "")), headers.of(jpeg, frame=frame)
+            caption, header = str(captions.get(frame, "")), headers.of(pictures.value(place), frame=frame)
             found.append(_StillPlace(frame, (pictures, place), crop, caption, header))
-            there.add((frame, hash(jpeg)))
+        there |= places.keys()
     for entity, pictures in of_pictures:
         if not entity.startswith(PATCHES):
             continue
@@ -373,6 +375,7 @@ def _stills(rows: _Rows) -> Sequence[RecordedStill]:
             header = headers.of(jpeg, frame=frame)
             if header is not None and (frame, hash(jpeg)) not in there:
                 found.append(_StillPlace(frame, (pictures, place), None, "", header))
+                there.add((frame, hash(jpeg)))
     return Mapped(sorted(found, key=lambda one: (one.frame, one.caption)), _StillPlace.read)
 
 

@@ -39,3 +39,12 @@ def test_what_is_no_damage_is_not_called_so(events, tmp_path, caplog):
     join_recordings([two], tmp_path / "joined.rrd", base_size=SIZE, fps=15)
     said = f"{two} is several recordings in one file, another begins after {odd.stat().st_size} bytes: the first is"
     assert [one.getMessage() for one in caplog.records] == [f"{said} exported", f"{said} joined"]
+
+
+def test_what_a_power_cut_left_twice_counts_once(events, tmp_path, monkeypatch):
+    """Where the file was not cut yet behind compacted rows, the video was left out, and stills came twice."""
+    stills = len(read_recordings([recorded(tmp_path / "whole.rrd", events)]).stills)
+    monkeypatch.setattr(os, "ftruncate", lambda *_: None)
+    read = read_recordings([recorded(tmp_path / "flight.rrd", events)])
+    assert ([one.frame_index for one in read.video], len(read.stills)) == (list(range(FRAMES)), stills)
+    assert stills
