@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import difflib
-import re
 import sys
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -178,7 +177,7 @@ def load(
 
     Raises `UserError` for an unknown flag or key, a value that its kind does not take, or an unreadable file.
     """
-    words = with_joined_values(sys.argv[1:] if argv is None else argv)
+    words = sys.argv[1:] if argv is None else argv
     _refuse_gone(config_class, words)
     parser = _flags(config_class, program=program, description=description, rare="--help-all" in words)
     given = vars(parser.parse_args(words))
@@ -209,17 +208,6 @@ def settings_words(settings: Mapping[str, object]) -> list[str]:
             else:
                 words.append(f"{flag}={one}")
     return words
-
-
-def with_joined_values(argv: Sequence[str]) -> list[str]:
-    """``--budget -5kbps`` as ``--budget=-5kbps``: argparse would take the value for a flag, and not name it."""
-    joined: list[str] = []
-    for word in argv:
-        if re.match(r"-[\d.]", word) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
-            joined[-1] += f"={word}"
-        else:
-            joined.append(word)
-    return joined
 
 
 def _gone(config_class: type) -> Mapping[str, str]:

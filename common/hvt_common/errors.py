@@ -118,9 +118,23 @@ class Parser(argparse.ArgumentParser):
         self.register("type", int, _number(int, "a whole number"))
         self.register("type", float, _number(float, "a number"))
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        return super().parse_known_args(_with_joined_values(args), namespace)
+
     def error(self, message: str) -> NoReturn:
         message = re.sub(r"ignored explicit argument (.*)", r"\1 is given, and it takes no value", message)
         raise UserError(f"{message}; see {self.prog} --help")
+
+
+def _with_joined_values(argv: Sequence[str] | None) -> list[str]:
+    """``--budget -5kbps`` as ``--budget=-5kbps``: argparse would take the value for a flag, and not name it."""
+    joined: list[str] = []
+    for word in sys.argv[1:] if argv is None else argv:
+        if re.match(r"-[\d.]", word) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _given_path(text: str) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fractions import Fraction
@@ -93,6 +94,15 @@ def parse_limit(text: str, *, name: str) -> Limit:
     raise UserError(
         f"{name} {text!r} is neither a time nor a size: write 1h, 14days or 200GB, at least 1s or 1MB"
     )
+
+
+def parse_age_s(text: str, *, name: str, also: str = "") -> float:
+    """``14days`` → seconds; ``also``: what else is accepted, for the sentence."""
+    with suppress(UserError):
+        seconds = parse_limit(text, name=name).seconds
+        if seconds is not None:
+            return seconds
+    raise UserError(f"{name} {text!r} is no time: write 12h or 3days{also}")
 
 
 def parse_size(text: str, *, name: str) -> tuple[int, int]:

@@ -518,7 +518,7 @@ def _check_window(config: EdgeConfig) -> None:
     if config.window < 2 / config.nominal_fps:
         raise UserError(
             f"--window {config.window:g}s is shorter than two frames of --fps {config.nominal_fps:g}: give "
-            f"--window {2 / config.nominal_fps:g}s or more, or another --fps"
+            f"--window {math.ceil(2000 / config.nominal_fps) / 1000:g}s or more, or another --fps"
         )
 
 

@@ -8,9 +8,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from hvt_common.config import with_joined_values
 from hvt_common.errors import Parser, UserError
-from hvt_common.runtime.reporting import say
+from hvt_common.runtime.reporting import check_writable, say
 from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s
 from hvt_ground.control import EdgeClient, RemoteEdge, RequestedStill, check_suffix
 
@@ -19,7 +18,7 @@ _TIMEOUT_S = 15.0
 
 def run(argv: Sequence[str]) -> int:
     """Run one command; `UserError` where an edge refuses it or the user can mend something."""
-    arguments = _parser().parse_args(with_joined_values(argv))
+    arguments = _parser().parse_args(argv)
     do = _prepare(arguments)
     with EdgeClient.connect(*arguments.connect, zenoh_config=arguments.zenoh_config) as edges:
         if arguments.command == "edges":
@@ -64,6 +63,7 @@ def _still(arguments: argparse.Namespace) -> Callable[[RemoteEdge], None]:
     timeout_s = parse_duration_s(arguments.timeout, name="--timeout")
     out: Path = arguments.out
     check_suffix(out)
+    check_writable(out, name="--out")
 
     def do(edge: RemoteEdge) -> None:
         still = edge.still(

@@ -235,8 +235,7 @@ def test_the_least_gain_reaches_the_suppression():
 
 
 def test_a_frame_rate_that_the_window_does_not_hold_is_refused_by_its_name():
-    """Who gave --fps 1 was told that a --window, which he had not given, is not accepted."""
-    with pytest.raises(
-        UserError, match="--window 1s is shorter than two frames of --fps 1: give --window 2s or"
-    ):
-        settled("--source", "demo", "--fps", "1")
+    """Who gave --fps 1 was told that a --window, which he had not given, is wrong; and the one to give was, too."""
+    with pytest.raises(UserError, match=r"--window 1s is shorter .* of --fps 1.5: give --window 1\.334s or"):
+        settled("--source", "demo", "--fps", "1.5")
+    assert settled("--source", "demo", "--fps", "1.5", "--window", "1.334s").window == 1.334

@@ -233,6 +233,7 @@ def test_the_other_commands_ask_what_they_say(edge, words, asked):
     [
         (["still", "--out", "crop.tif"], "crop.tif is not a picture that can be written"),
         (["still"], "--out"),
+        (["still", "--out", "/proc/a.png"], "--out /proc/a.png cannot be written"),
         (["still", "--box", "1,2,3", "--out", "a.png"], "--box '1,2,3' is not a box"),
         (["still", "--box", "1,2,3,4", "--track", "5", "--out", "a.png"], "not allowed with"),
         (["still", "--at", "soon", "--out", "a.png"], "--at 'soon' is not a duration"),

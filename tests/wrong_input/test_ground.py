@@ -80,7 +80,7 @@ def test_a_file_that_cannot_be_written(ground, here, flag, path):
         ("keep", "3parsecs", "14days or 200GB"),
         ("keep", "14", "14days or 200GB"),
         ("keep", "-1h", "14days or 200GB"),
-        ("keep-video", "3GB", "3days"),
+        ("keep-video", "3GB", "12h or 3days"),
     ],
 )
 def test_a_value_that_is_not_accepted(ground, flag, value, accepted):

@@ -11,9 +11,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from hvt_archive.index.database import read_index
-from hvt_common.errors import Parser, UserError
+from hvt_common.errors import Parser
 from hvt_common.runtime.reporting import say
-from hvt_common.units import SECOND_NS, parse_limit, shown_text, utc_text
+from hvt_common.units import SECOND_NS, parse_age_s, shown_text, utc_text
 from hvt_ground.recordings.row import RecordingRow
 
 _HEAD = ("file", "edge", "begin (UTC)", "length", "MB", "frames", "stills", "tracks by class")
@@ -38,8 +38,8 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _wanted(arguments: argparse.Namespace) -> Callable[[RecordingRow], bool]:
-    since_ns = None if arguments.since is None else _since_ns(arguments.since)
-    until_ns = None if arguments.until is None else _since_ns(arguments.until)
+    since_ns = None if arguments.since is None else _since_ns(arguments.since, name="--since")
+    until_ns = None if arguments.until is None else _since_ns(arguments.until, name="--until")
 
     def wanted(row: RecordingRow) -> bool:
         begin_ns, end_ns = row.begin_ns, row.end_ns
@@ -53,18 +53,12 @@ def _wanted(arguments: argparse.Namespace) -> Callable[[RecordingRow], bool]:
     return wanted
 
 
-def _since_ns(text: str) -> int:
+def _since_ns(text: str, *, name: str) -> int:
     # Unix time of ``2h`` ago, or of a date, UTC unless it says otherwise.
     try:
         date = datetime.fromisoformat(text)
     except ValueError:
-        try:
-            seconds = parse_limit(text, name="the time").seconds
-        except UserError:
-            seconds = None
-        if seconds is None:
-            raise UserError(f"{text!r} is no time: write 2h, 3days, 2026-11-22 or 2026-11-22T13:00") from None
-        return time.time_ns() - round(seconds * SECOND_NS)
+        return time.time_ns() - round(parse_age_s(text, name=name, also=", or 2026-11-22T13:00") * SECOND_NS)
     return round((date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()) * SECOND_NS
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from hvt_common.config import Group, SettingType
 from hvt_common.errors import UserError
-from hvt_common.units import Limit, parse_limit
+from hvt_common.units import Limit, parse_age_s, parse_limit
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Service
 
@@ -16,15 +16,8 @@ if TYPE_CHECKING:  # ``--help`` is to open no index
     from hvt_common.runtime.failures import Failures
 
 
-def _age(text: str, *, name: str) -> Limit:
-    limit = parse_limit(text, name=name)
-    if limit.seconds is None:
-        raise UserError(f"{name} {text!r} is no time: write 3days or 12h")
-    return limit
-
-
 _LIMIT = SettingType("LIMIT", parse_limit)
-_AGE = SettingType("AGE", _age)
+_AGE = SettingType("AGE", lambda text, *, name: Limit(seconds=parse_age_s(text, name=name)))
 _STORE = Group("retention of recordings")
 
 

@@ -342,16 +342,14 @@ class _StillPlace:
 
 def _stills(rows: _Rows) -> Sequence[RecordedStill]:
     headers = _Headers(rows.get((STILL_MESSAGES, _MESSAGE), []))
-    found, there = [], set()
+    found, there = [], set[tuple[int, int]]()
     of_pictures = [
         (entity, pictures)
         for (entity, component), pictures in rows.items()
         if component == _PICTURE and isinstance(pictures, SpooledRows)
     ]
-    for entity, pictures in of_pictures:
-        if not entity.endswith("/still"):
-            continue
-        slot = entity.removesuffix("/still")
+    of_slots = {path.removesuffix("/still"): one for path, one in of_pictures if path.endswith("/still")}
+    for slot, pictures in of_slots.items():
         captions = {frame: value[0] for frame, _, value in rows.get((slot, _CAPTION), []) if value}
         base = rows.get((f"{slot}/base", _PICTURE))
         crops = (
@@ -368,9 +366,7 @@ def _stills(rows: _Rows) -> Sequence[RecordedStill]:
             caption, header = str(captions.get(frame, "")), headers.of(pictures.value(place), frame=frame)
             found.append(_StillPlace(frame, (pictures, place), crop, caption, header))
         there |= places.keys()
-    for entity, pictures in of_pictures:
-        if not entity.startswith(PATCHES):
-            continue
+    for pictures in (one for entity, one in of_pictures if entity.startswith(PATCHES)):
         for place, (frame, _, jpeg) in enumerate(pictures):
             header = headers.of(jpeg, frame=frame)
             if header is not None and (frame, hash(jpeg)) not in there:

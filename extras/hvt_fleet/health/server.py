@@ -105,7 +105,8 @@ class HealthServer:
         *,
         failures: Failures,
     ) -> None:
-        host, port = host_and_port(address, name="--metrics", example="127.0.0.1:9464")
+        usual = "127.0.0.1:9464 for a ground, 127.0.0.1:9465 for an edge"
+        host, port = host_and_port(address, name="--metrics", example=usual)
 
         def bound() -> _Server:
             try:

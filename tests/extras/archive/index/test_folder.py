@@ -171,6 +171,7 @@ def test_an_index_that_cannot_be_written_disturbs_no_flight(tmp_path, events, ho
         sink.close()  # while nobody can write to the index: nobody waits for it
         eventually(lambda: failures.parts, what="it is said")
         assert [(one.part, one.working) for one in failures.parts] == [("recordings index", False)]
+        assert "Error" not in failures.parts[0].reason, "it is said in words"
         blocker.execute("ROLLBACK")
         if how == "no file":
             (tmp_path / INDEX).rmdir()

@@ -16,7 +16,7 @@ from rich.table import Table
 
 import hvt_edge.cli
 import hvt_ground.cli
-from hvt_common.errors import FlightError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.failures import Failures
 from hvt_fleet.health.server import Answer, HealthServer
 from hvt_fleet.health.status_command import StatusCommand
@@ -117,6 +117,12 @@ def test_status_at_what_is_no_address(main, port, capsys):
     assert main(["status", "--at", "here:99999"]) == 2
     said = f"--at 'here:99999' is not accepted: give HOST:PORT, such as 127.0.0.1:{port}\n"
     assert capsys.readouterr().err.partition(": ")[2] == said
+
+
+def test_a_wrong_address_is_told_the_one_that_status_asks():
+    """Who took the edge's advice had metrics at 9464, and `hvt-edge status` found no edge."""
+    with pytest.raises(UserError, match=r"give HOST:PORT, such as .*, 127\.0\.0\.1:9465 for an edge"):
+        HealthServer("here", STATE, failures=Failures(time.time_ns))
 
 
 def serving(port, answer):
