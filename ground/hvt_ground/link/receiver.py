@@ -149,7 +149,7 @@ class Receiver:
                     message = self._captures.filled(message, otherwise_ns=otherwise_ns)
             return [] if message is None else [Packet(message, item)]
         except WireError as error:
-            if row is Channel.BASE:
+            if row is Channel.BASE and not isinstance(error, UnknownVersionError):
                 self.stream.corrupt()
             self.skip(str(row), error)
         return []

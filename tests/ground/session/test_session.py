@@ -213,16 +213,17 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
     broken = Received(broken.key, broken.payload[:-1] + b"?", broken.attachment, broken.encoding, 1)
     nonsense = Received("hvt/uav-1/roi", b"x", b"\x93\x01", "", 1)
     other = Received("hvt/uav-1/tracks", b"x", b"", "", 1)
+    later = Received(broken.key, b"x", b"\x91\x06", "", 1)  # of another version: a keyframe would not help
     stranger = Flight(2)
     with Rig(flight) as rig:
-        rig.put(*bases(flight, 0, 1, 2, 1, 0), nonsense, other)
+        rig.put(*bases(flight, 0, 1, 2, 1, 0), nonsense, other, later)
         rig.put(flight.still(1, 0), flight.still(1, 0), stranger.still(0, 5), *bases(stranger, 1))
         rig.put(status := flight.status(base=3, roi=1), status)
         rig.settle()
         session = rig.receiver.session
         assert (session.reception.frames, session.frames_decoded, session.reception.stills) == (3, 3, 1)
         assert session.reception.ledger.messages(Account.META) == 1
-        assert rig.receiver.receiver.unusable == 3
+        assert rig.receiver.receiver.unusable == 4
         rig.put(broken)
         rig.settle()
         eventually(lambda: rig.port.keyframe_requests >= 1)
