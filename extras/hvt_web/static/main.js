@@ -79,6 +79,7 @@ function onMessage(message, payload) {
     case "hello":
       ({ role } = message);
       document.body.className = role;
+      by("commands").hidden = role !== "operator";
       by("role").textContent = role;
       forgetEvents();
       break;

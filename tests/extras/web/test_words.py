@@ -525,6 +525,11 @@ def test_the_types_of_the_page_hold():
     assert checked.returncode == 0, checked.stdout
 
 
+def test_commands_are_offered_to_nobody_of_whom_it_is_not_known_that_he_may_give_them():
+    """A viewer had all the buttons, and they did nothing: a style by name beat the one that hid them by role."""
+    assert '<fieldset id="commands" hidden>' in (STATIC / "index.html").read_text()
+
+
 def test_every_file_comes_from_the_ground():
     """A page at the end of a thin link, or in a closed network, would wait for the rest of the world."""
     names = {path.name for path in STATIC.iterdir()}
