@@ -58,5 +58,5 @@ def _from_file(path: Path) -> tuple[str, dict[str, float]]:
         return str(name), {str(key): float(value) for key, value in parameters.items()}
     except OSError as error:
         raise UserError(f"--tune {path} cannot be read ({error.strerror}): {_ACCEPTED}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, RecursionError, KeyError, TypeError, AttributeError):
         raise UserError(f"--tune {path} is no result of a search: {_ACCEPTED}") from None

@@ -83,7 +83,7 @@ def table_of(text: str | None) -> Mapping[str, Any]:
     """A table in JSON, as columns of a row hold it; empty for anything else."""
     try:
         found = json.loads(text or "{}")
-    except (ValueError, TypeError):
+    except (ValueError, RecursionError, TypeError):
         return {}
     return found if isinstance(found, Mapping) else {}
 

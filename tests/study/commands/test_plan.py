@@ -153,12 +153,14 @@ def test_parameters_are_those_of_the_runs(tmp_path):
         ("M5:small_weight=-1", "write a number from 0"),
         ("there-is-none.json", "cannot be read"),
         ("bad.json", "is no result of a search"),
+        ("deep.json", "is no result of a search"),
     ],
 )
 def test_wrong_parameters_are_one_sentence(tmp_path, monkeypatch, word, said):
     """A slip of the pen would be flown for days."""
     monkeypatch.chdir(tmp_path)
     Path("bad.json").write_text('{"method": "M5"}')
+    Path("deep.json").write_text("[" * 100_000)
     with pytest.raises(UserError, match=said) as caught:
         tuned_methods([word])
     assert "\n" not in str(caught.value)

@@ -203,7 +203,7 @@ def load_example(folder: Path) -> Example | None:
         if not (place / _FILE).exists():
             return None
         raise UserError(f"{place} lacks a picture: remove the folder, and the report does without") from None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
         raise UserError(
             f"{place / _FILE} is damaged: remove the folder, and the report does without"
         ) from None
