@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import optuna
@@ -28,6 +27,7 @@ from hvt_study.commands.arguments import (
 from hvt_study.commands.output import RunProgress, make_out, print_columns, print_lines, writing
 from hvt_study.matrix.plan import StudyPlan, spec_of
 from hvt_study.matrix.tuning import tuning_texts
+from hvt_study.report.data.arms import picture_of
 from hvt_study.runs.execute import runner
 from hvt_study.runs.methods import METHODS as FLOWN
 
@@ -56,17 +56,14 @@ def tunable(method: str, names: Iterable[str] = ()) -> dict[str, float]:
 
 
 def split(
-    sequences: Sequence[tuple[str, str]],
-    *,
-    held_out: float,
-    pictures: Mapping[tuple[str, str], str] = MappingProxyType({}),
+    sequences: Sequence[tuple[str, str]], *, held_out: float
 ) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """(training, held out), by a hash of the name: the same sequences in every run, whatever else is in the set.
 
-    ``pictures`` names those that several sequences are flown over: a picture of one side does not go to the other.
-    Raises `UserError` where there are not two names, or the share leaves one side empty.
+    Of several over one picture (`picture_of`), none goes to the other side. Raises `UserError` where there are not two
+    names, or the share leaves one side empty.
     """
-    names = [pictures.get(one, one[1]) for one in sequences]
+    names = [picture_of(f"{uri}#{name}").rpartition("#")[2] for uri, name in sequences]
     order = sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).digest())
     if len(order) < 2 or not 0 < held_out < 1:
         of = "" if len(order) == len(names) else f" of {len(order)} pictures"
@@ -224,8 +221,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(
             f"--still-codecs {arguments.still_codecs} are several: parameters are searched for one, name it"
         )
-    pictures = {(uri, one.name): one.files[0].stem for uri, one in sequences if one.dataset == "still"}
-    train, held_out = split(plan.sequences, held_out=arguments.held_out, pictures=pictures)
+    train, held_out = split(plan.sequences, held_out=arguments.held_out)
     written = make_out(arguments.out, name="tune.json")
     pool, _ = open_pool(arguments)
     progress = RunProgress(f"{arguments.method}, trials")

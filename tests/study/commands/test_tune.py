@@ -121,11 +121,11 @@ def test_a_sequence_stays_on_its_side():
     assert not set(train) & set(held_out)
     assert split(names, held_out=0.25) == (train, held_out)
     assert set(split(list(reversed(names)), held_out=0.25)[1]) == set(held_out)
-    # Four ways of the camera over each of ten pictures: what was searched on is not said to be new.
-    pictures = {one: f"picture{number // 4}" for number, one in enumerate(names)}
-    train, held_out = (
-        {pictures[one] for one in side} for side in split(names, held_out=0.2, pictures=pictures)
-    )
-    assert (len(train), len(held_out), train & held_out) == (8, 2, set())
-    with pytest.raises(UserError, match="4 sequences of 1 pictures with --held-out"):
-        split(names[:4], held_out=0.2, pictures=pictures)
+    # Four ways of the camera over each of ten pictures, and scenes with codes or without: what was searched on is not
+    # said to be new.
+    for dataset, ends in (("still:air?seeds=0-3", "0123"), ("demo:0-9", ["", "codes", "4k", "codes-4k"])):
+        names = [(dataset, f"demo-{picture}-{end}") for picture in range(10) for end in ends]
+        train, held_out = ({names.index(one) // 4 for one in side} for side in split(names, held_out=0.2))
+        assert (len(train), len(held_out), train & held_out) == (8, 2, set())
+        with pytest.raises(UserError, match="4 sequences of 1 pictures with --held-out"):
+            split(names[:4], held_out=0.2)

@@ -448,18 +448,24 @@ def test_few_and_no_values():
     assert (equal.low, equal.high) == (pytest.approx(0.3), pytest.approx(0.3))
 
 
-def test_seeds_over_one_picture_are_no_sequences_of_their_own():
+@pytest.mark.parametrize(
+    "names",
+    [
+        lambda p: [f"still:air?seeds=0-2&view=0.6#{p}-{seed}" for seed in range(3)],
+        lambda p: [f"demo:0-4#demo-{p}", f"demo:0-9,codes#demo-{p}-codes", f"demo:0-4,4k#demo-{p}-4k"],
+        lambda p: [f"mot:flights{rate}#{p}" for rate in ("", "?fps=15", "?fps=30")],
+    ],
+)
+def test_seeds_over_one_picture_are_no_sequences_of_their_own(names):
     """Ten flights over two pictures had an interval as of ten pictures, and made a verdict."""
-    dataset, figures = "still:air?seeds=0-9&view=0.6", [0.1, 0.4, 0.2, 0.8, 0.3]
+    figures = [0.1, 0.4, 0.2, 0.8, 0.3]
 
-    def found(pictures, seeds):
-        return interval_of(
-            {f"{dataset}#{p}-{seed}": figures[p] for p in range(pictures) for seed in range(seeds)}
-        )
+    def found(pictures):
+        return interval_of({name: figures[p] for p in range(pictures) for name in names(p)})
 
-    assert math.isnan(found(4, 10).low)
-    assert found(4, 10).sequences == 40
-    once, often = _interval(figures), found(5, 3)
+    assert math.isnan(found(4).low)
+    assert found(4).sequences == 12
+    once, often = _interval(figures), found(5)
     assert (often.low, often.high) == (pytest.approx(once.low), pytest.approx(once.high))
 
 

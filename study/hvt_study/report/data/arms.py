@@ -292,13 +292,13 @@ def sequence_of(row: RunRow) -> str:
 
 
 def picture_of(name: str) -> str:
-    """The picture of a sequence, by its `sequence_of`: several seeds of ``still:`` have one picture."""
+    """The picture of a sequence, by its `sequence_of`, whatever its options, seed or words of ``demo:``."""
     dataset, _, sequence = name.rpartition("#")
-    place, _, options = dataset.rpartition("?")
-    seeds = dict(parse_qsl(options)).get("seeds", "0")
-    if not dataset.startswith("still:") or not place:
-        return name
-    return f"{place}#{sequence if seeds == '0' else sequence.rpartition('-')[0]}"
+    place, _, options = dataset.partition("?")
+    if place.startswith("demo:"):
+        return "-".join(sequence.split("-")[:2])
+    seeded = place.startswith("still:") and dict(parse_qsl(options)).get("seeds", "0") != "0"
+    return f"{place}#{sequence.rpartition('-')[0] if seeded else sequence}"
 
 
 def clip_of(row: RunRow) -> str:
