@@ -13,12 +13,14 @@ from hvt_common.inference.runtimes.model_file import check_onnx_file
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models
+from hvt_common.runtime.process import interrupt_on_signals
 
 _PROGRAM = "python -m hvt_train"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; 0, or 2 after one sentence on stderr where the user can mend something."""
+    interrupt_on_signals()
     return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
 
 
