@@ -17,7 +17,7 @@ from hvt_common.files import read_text
 from hvt_common.inference.labels import read_labels
 from hvt_common.transport.zenoh_config import LinkSettings, key_pair
 from hvt_edge.config import EdgeConfig
-from hvt_study.datasets.label_files import read_text as read_annotations
+from hvt_study.datasets.annotation_rows import label_text
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_text_is_read_as_its_byte_order_mark_says(encoding, tmp_path):
     """Notepad's files began with a strange character, or were no text at all."""
     file = tmp_path / "file.txt"
     file.write_text("Straße", encoding=encoding)
-    assert read_text(file) == read_annotations(file) == "Straße"
+    assert read_text(file) == label_text(file) == "Straße"
 
 
 def test_bytes_that_are_no_text_are_an_error_of_the_file(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,12 @@ from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import check_whole, names_of, option
 from hvt_study.commands.output import RunProgress, decimals, make_out, print_columns, writing
+from hvt_study.datasets.class_map import VEHICLE, VEHICLES
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.judged import FrameView, Judged, judged
 from hvt_study.metrics.picture_score import (
-    VEHICLES,
     above,
     along_line,
     as_one,
@@ -55,7 +55,7 @@ _RED = (60, 60, 255)
 class Finding:
     """One box of a picture, x1 y1 x2 y2 in its pixels; ``weight`` orders, the largest first."""
 
-    path: Path
+    picture: LabelledPicture
     box_px: Sequence[float]
     text: str
     weight: float
@@ -78,7 +78,7 @@ def write_sheet(path: Path, findings: Sequence[Finding]) -> None:
 
 
 def _cell(finding: Finding) -> Image:
-    image = cv2.imread(str(finding.path), cv2.IMREAD_COLOR)
+    image = read_image(finding.picture.path, finding.picture.labelled_size)
     assert image is not None, "it was detected on"
     x1, y1, x2, y2 = finding.box_px
     reach = max(_LEAST_CROP_PX, _CONTEXT * max(x2 - x1, y2 - y1))
@@ -95,7 +95,6 @@ def _cell(finding: Finding) -> Image:
 
 _LEAST_CONFIDENCE = 0.01
 """Average precision needs the whole curve."""
-_VEHICLE = "vehicle"
 _COLUMNS = ("file", "x1", "y1", "x2", "y2", "confidence", "class")
 _Word = Callable[[str], str]
 
@@ -160,7 +159,7 @@ def _detect(arguments: argparse.Namespace) -> int:
     for written in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
         check_not_read(arguments.out / written, reads, name="--out")
         make_out(arguments.out, name=written)
-    paths, frames, seen = [], [], 0
+    shown, frames, seen = [], [], 0
     with (arguments.out / "detections.csv").open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
@@ -169,7 +168,7 @@ def _detect(arguments: argparse.Namespace) -> int:
             view = detected(detector, image, size)
             table.writerows(_rows(picture.path, view, confidence))
             if labels is not None:
-                paths.append(picture.path)
+                shown.append(picture)
                 frames.append((labels, view))
     if frames:
         recall_only = any(picture.one_target for picture in pictures)
@@ -183,11 +182,12 @@ def _detect(arguments: argparse.Namespace) -> int:
             **picture_score(used, detection_score(every), recall_only=recall_only),
         }
         write_json(arguments.out / "score.json", about)
-        _write_sheets(arguments.out, paths, used, classes=classes, recall_only=recall_only)
+        found = zip(shown, used, strict=True)
+        _write_sheets(arguments.out, found, classes=classes, recall_only=recall_only)
         print_score(about)
         if not recall_only:
             of_sets = (
-                [frame for path, frame in zip(paths, used, strict=True) if path in known]
+                [frame for picture, frame in zip(shown, used, strict=True) if picture.path in known]
                 for known in ({one.path for one in of_set} for of_set in sets.values())
             )
             _print_calibration(dict(zip(map(str, sets), of_sets, strict=True)), classes)
@@ -239,7 +239,7 @@ def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word:
     """The words that count: those of ``--labelled``, else every class that the labels may use."""
     known = sorted({name for picture in pictures for name in picture.class_names})
     names = labelled or known
-    if labelled and _VEHICLE in labelled:
+    if labelled and VEHICLE in labelled:
         names = [*names, *VEHICLES]
     counted = {word(name) for name in names}
     if known and counted.isdisjoint(map(word, known)):
@@ -248,20 +248,20 @@ def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word:
 
 
 def _write_sheets(
-    out: Path, paths: Sequence[Path], used: Sequence[Judged], *, classes: Sequence[str], recall_only: bool
+    out: Path, found: Iterable[tuple[LabelledPicture, Judged]], *, classes: Sequence[str], recall_only: bool
 ) -> None:
     """The surest false alarms, where all objects are labelled, and the largest labels that were missed."""
     false, missed = [], []
-    for path, frame in zip(paths, used, strict=True):
+    for picture, frame in found:
         labels, boxes = right_boxes(frame, classes=classes)
         view = frame.view
         for row in np.setdiff1d(np.arange(len(view)), boxes).tolist():
             sure = float(view.confidences[row])
             text = f"{view.class_names[row]} {sure:.2f}"
-            false.append(Finding(path, view.boxes_xyxy_px[row].tolist(), text, sure))
+            false.append(Finding(picture, view.boxes_xyxy_px[row].tolist(), text, sure))
         for row in np.setdiff1d(np.arange(len(frame.class_names)), labels).tolist():
             box = frame.boxes_xyxy_px[row].tolist()
-            missed.append(Finding(path, box, frame.class_names[row], float(frame.areas_px2[row])))
+            missed.append(Finding(picture, box, frame.class_names[row], float(frame.areas_px2[row])))
     write_sheet(out / "false-alarms.png", [] if recall_only else false)
     write_sheet(out / "misses.png", missed)
 

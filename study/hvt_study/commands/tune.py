@@ -60,7 +60,7 @@ def split(
 ) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """(training, held out), by a hash of the name: the same sequences in every run, whatever else is in the set.
 
-    Of several over one picture (`picture_of`), none goes to the other side. Raises `UserError` where there are not two
+    Of several over one picture (`picture_of`) none goes to the other side. Raises `UserError` where there are not two
     names, or the share leaves one side empty.
     """
     names = [picture_of(f"{uri}#{name}").rpartition("#")[2] for uri, name in sequences]

@@ -6,9 +6,10 @@ A wrong line of a dataset is left out; in results that are to be judged it ends 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 LAST_FRAME = 10_000_000
 """Over 90 hours at 30 fps; a higher frame number is a mistake."""
-_LARGEST = 1e9
+LARGEST = 1e9
 """Beyond it no pixel and no id lies; ids stay exact in floats."""
 _SHOWN_CHARS = 60
 
@@ -76,22 +77,21 @@ class Rows:
 def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_dataset: bool = False) -> Rows:
     """Read a file of which the columns between commas are called so; further ones and blank lines are no matter.
 
-    Every line must have the ``least`` first ones and as many as the first line, of which ``frames`` are counted by
-    the first column. A line that is not so is left out ``of_dataset``, as long as there are others; else `UserError`
+    Every line must have the ``least`` first ones and as many as most lines, of which ``frames`` are counted by the
+    first column. A line that is not so is left out ``of_dataset``, as long as there are others; else `UserError`
     names it.
     """
     numbered = [
         (number, line.strip())
-        for number, line in enumerate(_text(path).splitlines(), start=1)
+        for number, line in enumerate(label_text(path).splitlines(), start=1)
         if line.strip()
     ]
     names = tuple(columns.split(","))
     lines = tuple(line for _, line in numbered)
-    count = min(len(names), len(lines[0].rstrip(",").split(","))) if lines else least
-    count = max(count, least)
+    count = max(least, min(len(names), usual_cells(lines)))
     wanted = f"finite numbers {','.join(names[:least])}" + (",…" if len(names) > least else "")
     table = _numbers(lines, count)
-    good = np.asarray((np.abs(table) < _LARGEST).all(axis=1), np.bool_)  # false for NaN
+    good = np.asarray((np.abs(table) < LARGEST).all(axis=1), np.bool_)  # false for NaN
     if frames:
         wanted += f" with a whole frame number from 0 to {LAST_FRAME}"
         with np.errstate(invalid="ignore"):
@@ -106,11 +106,17 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_d
     return rows.only(once | (rows["id"] <= 0), accepted="each id once in a frame")
 
 
-def _text(path: Path) -> str:
+def usual_cells(lines: Sequence[str]) -> int:
+    """How many numbers most lines have, whatever the first one is; 0 where there is none."""
+    return mode([line.rstrip(",").count(",") + 1 for line in lines] or [0])
+
+
+def label_text(path: Path) -> str:
+    """Of a text file; `UserError` where it cannot be read."""
     try:
         return read_text(path, most=MOST_TABLE_BYTES)
     except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror}); accepted are lines of numbers") from None
+        raise UserError(f"{path} cannot be read ({error.strerror})") from None
 
 
 def _numbers(lines: tuple[str, ...], count: int) -> npt.NDArray[np.float64]:

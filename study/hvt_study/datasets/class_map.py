@@ -15,8 +15,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import MOVING, kind_of
 from hvt_common.inference.labels import first_synonym
 
-_VEHICLE = "vehicle"
-_VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
+VEHICLE = "vehicle"
+VEHICLES = frozenset({"car", "truck", "bus", VEHICLE})
 """The kinds behind the name where a dataset calls all of them so."""
 _SHOWN = 12
 
@@ -63,7 +63,7 @@ def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> C
 def of_kinds(names: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
     """Those of some class names that are of these kinds, in their order; ``vehicle`` is a car, truck or bus too."""
     wanted = {kind_of(kind) for kind in kinds}
-    wanted |= _VEHICLES if _VEHICLE in wanted else set()
+    wanted |= VEHICLES if VEHICLE in wanted else set()
     return tuple(name for name in names if kind_of(name) in wanted)
 
 
@@ -80,11 +80,11 @@ def _pair(
 
 
 def _by_kind(names: Collection[str], classes: Collection[str]) -> dict[str, list[str]]:
-    all_one = any(_plain(name) == _VEHICLE for name in classes)
+    all_one = any(_plain(name) == VEHICLE for name in classes)
     found: dict[str, list[str]] = defaultdict(list)
     for name in names:
         kind = kind_of(name)
-        found[_VEHICLE if all_one and kind in _VEHICLES else kind].append(name)
+        found[VEHICLE if all_one and kind in VEHICLES else kind].append(name)
     return found
 
 

@@ -27,6 +27,7 @@ from hvt_common import files
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import numbered_names, read_labels
 from hvt_edge.source.folder import sequence_files
+from hvt_study.datasets.annotation_rows import label_text
 from hvt_study.datasets.labels import FrameLabels, LabelDoubts
 
 LOOKED_IN = (
@@ -60,8 +61,11 @@ class Folders:
 
     def find(self, path: Path) -> Path | None:
         """The file or folder of this path, each of its names in any case; None where there is none."""
-        if path.exists():
-            return path
+        try:
+            if path.exists():
+                return path
+        except OSError:  # the name is too long for any file
+            return None
         above = None if path.parent == path else path.parent
         folder = above if above is None or above.is_dir() else self.find(above)
         if folder is None or not folder.is_dir():
@@ -179,7 +183,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     import yaml  # noqa: PLC0415 - of the study alone; hvt-study sweep runs where only the edge is installed
 
     try:
-        found = yaml.load(read_text(path), yaml.BaseLoader)  # noqa: S506 - makes text, lists and tables alone
+        found = yaml.load(label_text(path), yaml.BaseLoader)  # noqa: S506 - makes text, lists and tables alone
     except (yaml.YAMLError, RecursionError) as error:
         said = " ".join(str(error).split())
         raise UserError(f"{path} is no YAML ({said}): mend it, or name the classes in classes.txt") from None
@@ -190,14 +194,6 @@ def _words(value: object) -> list[str]:
     """Of a word or a list; none of anything else."""
     every = [value] if isinstance(value, str) else list(value) if isinstance(value, list | tuple) else []
     return [one for one in every if isinstance(one, str)]
-
-
-def read_text(path: Path) -> str:
-    """A text file; `UserError` where it cannot be read."""
-    try:
-        return files.read_text(path, most=files.MOST_TABLE_BYTES)
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror})") from None
 
 
 def _folders(root: Path, depth: int) -> list[Path]:
@@ -319,7 +315,7 @@ def read_yolo(
     """
     rows = []
     doubts.classes = len(names)
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(label_text(path).splitlines(), start=1):
         if not line.strip():
             continue
         try:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
-from hvt_study.datasets.labels import FrameLabels, check_pixels, covered_share, inside_frame
+from hvt_study.datasets.labels import NO_ID, FrameLabels, check_pixels, covered_share, inside_frame
 
 _COVERED = 0.5
 """An object with so much of it in regions of which nothing is known does not count, as in VisDrone's toolkit."""
@@ -66,7 +66,10 @@ class LabelTable:
         size: tuple[int, int],
         origin: float = 0.0,
     ) -> LabelTable:
-        """Those rows that are ``judged``, cut at the frame of this (width, height); empty ones are left out."""
+        """Those rows that are ``judged``, cut at the frame of this (width, height); empty ones are left out.
+
+        A number below 0, or of two objects of a frame, as where all have 0, says nothing of who is who.
+        """
         check_pixels(rows.path, [rows[side] for side in "xywh"])
         frames, boxes = rows["frame"].astype(np.int64), inside_frame(rows.boxes(origin=origin), size)
         regions = inside_frame(ignored.boxes, size)
@@ -74,6 +77,8 @@ class LabelTable:
         chosen = _rows_with_area(frames, boxes)
         chosen = chosen[judged[chosen]]
         ids = rows["id"].astype(np.int64)[chosen]
+        pairs, count = np.unique(np.stack((frames[chosen], ids)), axis=1, return_counts=True)
+        ids[(ids < 0) | np.isin(ids, pairs[1, count > 1])] = NO_ID
         passed = Regions(ignored.frames[places], regions[places], ignored.land[places])
         return cls(frames[chosen], boxes[chosen], ids, class_ids[chosen], class_names, passed)
 
@@ -83,16 +88,10 @@ class LabelTable:
         return tuple(sorted(self.class_names))
 
     @property
-    def first_frame(self) -> int | None:
-        """The lowest frame number; None where there is none."""
-        begins = [frames[0] for frames in (self.frames, self.ignored.frames) if len(frames)]
-        return int(min(begins)) if begins else None
-
-    @property
-    def last_frame(self) -> int:
-        """The highest frame number; -1 where there is none."""
-        ends = [frames[-1] for frames in (self.frames, self.ignored.frames) if len(frames)]
-        return int(max(ends, default=-1))
+    def span(self) -> tuple[int, int] | None:
+        """The lowest and the highest frame number; None where there is none."""
+        every = np.concatenate((self.frames, self.ignored.frames))
+        return (int(every.min()), int(every.max())) if len(every) else None
 
     def at(self, frame: int) -> FrameLabels:
         """The labels of a frame; objects mostly in unlabelled regions are left out."""

@@ -23,6 +23,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Image
 from hvt_edge.source.folder import sequence_files
+from hvt_study.datasets.annotation_rows import LARGEST, label_text
 from hvt_study.datasets.label_files import (
     LOOKED_IN,
     YAML,
@@ -37,7 +38,6 @@ from hvt_study.datasets.label_files import (
     number_of,
     pictures_below,
     read_class_file,
-    read_text,
     read_voc,
     read_yolo,
     yaml_folders,
@@ -78,7 +78,8 @@ class LabelledPicture:
     @property
     def unreadable(self) -> str:
         """Why there is no picture, in words."""
-        return f"{self.path} {'cannot be read as a picture' if self.path.exists() else 'does not exist'}"
+        there = Folders().find(self.path) is not None
+        return f"{self.path} {'cannot be read as a picture' if there else 'does not exist'}"
 
     def read(self, size: tuple[int, int]) -> FrameLabels | None:
         """The labels in the pixels of the picture, which is (width, height) large.
@@ -208,7 +209,7 @@ def read_image(path: Path, labelled_size: tuple[int, int] | None = None) -> Imag
 
 def _has_commas(texts: Sequence[Path]) -> bool:
     """Whether lines are VisDrone's; of the first file that has any. A decimal comma is none of VisDrone's."""
-    first = next((line for path in texts for line in read_text(path).splitlines() if line.strip()), None)
+    first = next((line for path in texts for line in label_text(path).splitlines() if line.strip()), None)
     if first is None:
         return texts[0].parent.name.lower() == "annotations"
     words = first.split()
@@ -229,7 +230,7 @@ def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> lis
 def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
     """COCO's ``images``, ``annotations`` (also ``annotation``) and ``categories``."""
     try:
-        about = json.loads(read_text(path))
+        about = json.loads(label_text(path))
         categories = [(_id(row["id"]), str(row["name"] or "")) for row in about["categories"]]
         names = dict(categories)
         unclear_names = {key for key, name in categories if names[key] != name}
@@ -252,11 +253,14 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
                 )
                 continue
             of[image].append({**row, "name": names[category], "where": where})
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        why = f"{error}" if isinstance(error, ValueError) else "it lacks images, annotations or categories"
+    except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+        why = (
+            f"{error}"
+            if isinstance(error, ValueError | RecursionError)
+            else "it lacks images, annotations or categories"
+        )
         raise UserError(f"{path} is not COCO's JSON: {why}") from None
-    sides = (side for row in rows for side in row.get("bbox") or ())
-    check_pixels(path, [side for side in sides if isinstance(side, int | float)])
+    check_pixels(path, [side for row in rows for side in row.get("bbox") or () if _is_number(side)])
     folders = Folders()
     pictures: dict[Path, tuple[str, Any, tuple[int, int] | None]] = {}
     unclear = {key for key, count in Counter(key for key, _, _ in images).items() if count > 1}
@@ -284,6 +288,10 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
     ]
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and abs(value) < LARGEST
+
+
 def _id(value: Any) -> Any:
     """A number is one also where a tool writes it as text."""
     return int(value) if isinstance(value, str) and value.isdecimal() else value
@@ -296,9 +304,8 @@ def _said_size(image: Mapping[str, Any]) -> tuple[int, int] | None:
 
 def _coco_row(row: Mapping[str, Any]) -> _Annotation:
     box = row.get("bbox")
-    name = "ignore" if row.get("iscrowd") or row.get("ignore") else str(row["name"])
-    numbers = isinstance(box, list) and len(box) == 4 and all(isinstance(side, int | float) for side in box)
-    if box is None or not numbers:
+    name = "ignore" if _id(row.get("iscrowd")) or _id(row.get("ignore")) else str(row["name"])
+    if not (isinstance(box, list) and len(box) == 4 and all(map(_is_number, box))):
         return name, None, f"{row['where']} has the box {box}: it"
     x, y, wide, high = box
     return name, (x, y, x + wide, y + high), str(row["where"])

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.class_names import kind_of
+from hvt_study.datasets.class_map import VEHICLE, VEHICLES
 from hvt_study.metrics.detection import AveragePrecision, DetectionScore
 from hvt_study.metrics.judged import Judged, LabelledFrame, matched_rows
 
@@ -111,14 +112,10 @@ def _logits(confidences: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.asarray(np.log(clipped / (1 - clipped)))
 
 
-_VEHICLE = "vehicle"
-VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
-
-
 def as_one(name: str) -> str:
     """The kind of a class, all vehicles being one."""
     kind = kind_of(name)
-    return _VEHICLE if kind in VEHICLES or kind.endswith(_VEHICLE) else kind
+    return VEHICLE if kind in VEHICLES or kind.endswith(VEHICLE) else kind
 
 
 def above(frames: Sequence[LabelledFrame], confidence: float) -> list[LabelledFrame]:

@@ -182,8 +182,9 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     assert "--confidence is 2.0, must be from 0.01 to 1" in sentence(
         capsys, folder, "--confidence", 2, "--out", out
     )
-    (tmp_path / "bad.json").write_text("[]")
-    assert "is not COCO's JSON" in sentence(capsys, tmp_path / "bad.json", "--out", out)
+    for bad in ("[]", "[" * 100_000):
+        (tmp_path / "bad.json").write_text(bad)
+        assert "is not COCO's JSON" in sentence(capsys, tmp_path / "bad.json", "--out", out)
     assert not out.exists()
     out.write_text("")
     named = (folder, "--classes", CLASSES)

@@ -13,6 +13,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_scene import Scene
 from hvt_study.datasets.annotation_rows import read_rows
+from hvt_study.datasets.labels import NO_ID
 from hvt_study.datasets.layouts.mot import mot_table, read_truth_rows
 from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.datasets.sequence import content_hash, stage_clip
@@ -372,10 +373,11 @@ def test_an_id_is_one_object_of_a_frame(tmp_path, caplog):
     (sequence,) = open_dataset(f"mot:{tmp_path}")
     assert sequence.labels(0).ids.tolist() == [1, 2]
     assert "1 of 3 lines are left out" in caplog.text
-    write_mot(tmp_path / "a", rows="1,-1,11,11,9,9,1,1,1\n1,-1,31,11,9,9,1,1,1\n")
-    (sequence,) = open_dataset(f"mot:{tmp_path}")
-    assert len(sequence.labels(0)) == 2
-    assert not sequence.one_target, "nobody knows which object is which"
+    for nobody in (-1, 0):
+        write_mot(tmp_path / "a", rows="".join(f"1,{nobody},{x},11,9,9,1,1,1\n" for x in (11, 31)))
+        (sequence,) = open_dataset(f"mot:{tmp_path}")
+        assert sequence.labels(0).ids.tolist() == [NO_ID] * 2
+        assert not sequence.one_target, "nobody knows which object is which"
 
 
 def test_pictures_of_another_size_than_a_sequence_says_are_refused(tmp_path):
@@ -546,10 +548,10 @@ def test_labels_follow_their_file(tmp_path):
 
 
 def test_lines_of_any_length_are_read_alike(tmp_path):
-    """Columns beyond the known ones, and a comma at the end of some lines, are no matter."""
+    """Columns beyond the known ones, and a comma at the end of some lines, are no matter, nor is a remark above."""
     path = tmp_path / "a.txt"
-    path.write_text("1,2,3\n4,5,6,\n7,8,9,10\n\n")
-    rows = read_rows(path, columns="frame,id,x", least=2)
+    path.write_text("# mine\n1,2,3\n4,5,6,\n7,8,9,10\n\n")
+    rows = read_rows(path, columns="frame,id,x", least=2, of_dataset=True)
     assert rows.table.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
     assert rows["y"].tolist() == [-1, -1, -1]
     path.write_text("")

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from hvt_common.errors import UserError
+from hvt_study.commands.detect import Finding, write_sheet
 from hvt_study.datasets.label_files import read_class_file
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import FrameLabels
@@ -175,7 +176,8 @@ def test_one_bad_row_costs_itself_alone(tmp_path: Path) -> None:
         ([190, 90, 20, 20], [BOX, [190, 90, 200, 100]], "by 10 px"),
         ([500, 90, 20, 20], [BOX], "1 labels were left out; the first: COCO annotation 1"),
         ([1, 2, 3], [BOX], "has the box [1, 2, 3]"),
-        ([float("nan"), 1, 2, 3], [BOX], "annotation 1 of labels.json has no box of four numbers"),
+        ([float("nan"), 1, 2, 3], [BOX], "has the box [nan, 1, 2, 3]: it has no box of four numbers"),
+        ([10**400, 1, 2, 3], [BOX], "has the box [1000"),
         ([5, 5, -2, 4], [BOX], "has a box outside the picture of 200x100, or without area"),
         ("none", [BOX], "has the box none: it has no box of four numbers"),
     ],
@@ -209,6 +211,10 @@ def test_a_picture_that_was_labelled_as_it_lies_is_read_so(tmp_path: Path) -> No
     image = read_image(one.path, one.labelled_size)
     assert image is not None
     assert image.shape == (100, 200, 3)
+    write_sheet(tmp_path / "sheet.png", [Finding(one, [150, 20, 190, 60], "", 1.0)])
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet is not None
+    assert sheet[75, 75].tolist() == [90, 90, 90], "and the place of a box is shown where it lies"
     np.testing.assert_allclose(labels.boxes_xyxy_px, [BOX])
     text(tmp_path / "labels.json", coco(width=100, height=200))  # labelled as it is shown
     ((one, _),) = read(tmp_path)
@@ -237,9 +243,10 @@ def test_a_picture_that_was_resized_has_its_boxes_scaled(tmp_path: Path, width: 
 
 def test_a_picture_that_is_not_there_is_called_so(tmp_path: Path) -> None:
     """A path that is wrong would be looked for among damaged files."""
-    text(tmp_path / "labels.json", coco())
-    (one,) = find_pictures(tmp_path / "labels.json", classes=None)
-    assert one.unreadable.endswith("a.jpg does not exist")
+    for name in (f"{'a' * 300}.jpg", "a.jpg"):
+        text(tmp_path / "labels.json", coco(name))
+        (one,) = find_pictures(tmp_path / "labels.json", classes=None)
+        assert one.unreadable.endswith("a.jpg does not exist")
     text(one.path, "no picture")
     assert one.unreadable.endswith("a.jpg cannot be read as a picture")
     assert cv2.imread(str(one.path)) is None
@@ -318,6 +325,7 @@ def test_cocos_own_layout_is_found(tmp_path: Path, place: str) -> None:
     picture(tmp_path / place / "a b.JPG")
     about = json.loads(coco("a%20b.jpg"))
     about["images"][0]["id"], about["categories"][0]["id"] = "1", "5"
+    about["annotations"][0]["iscrowd"] = "0"
     text(tmp_path / "annotations/instances_val2017.json", json.dumps(about))
     text(tmp_path / "annotations/captions_val2017.json", '{"images": [], "annotations": []}')
     ((_, found),) = read(tmp_path)

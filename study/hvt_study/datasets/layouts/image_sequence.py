@@ -18,7 +18,7 @@ from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.resample import base_frame_count
 from hvt_edge.source.video import VideoSource
-from hvt_study.datasets.label_table import LabelTable, TableLabels
+from hvt_study.datasets.label_table import TableLabels
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
 
@@ -74,19 +74,21 @@ class ImageSequence:
         frame_count = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
         known = None if labels is None else labels.table()
         begins, count = self.first_number, self.frame_count
-        first, last = (None, 0) if known is None else (known.first_frame, known.last_frame)
-        if labels is not None and first is None:
+        end = begins + count - 1
+        span = None if known is None else known.span
+        if labels is not None and span is None:
             raise UserError(
                 f"annotations {labels.arguments[0]} are empty: accepted are objects or regions within the pictures, "
                 "or ?labels=none, for pictures alone"
             )
-        if first is not None and (
-            not (begins <= last and first < begins + count)
+        first, last = span or (begins, end)
+        if (
+            not (begins <= last and first <= end)
             or (first < begins and (begins == 1 or last - count in (-1, 0)))
             or (first > begins == 0 and last == count)
         ):
             raise UserError(
-                f"sequence folder {self.folder} has images {begins} to {begins + count - 1}, and its annotations are "
+                f"sequence folder {self.folder} has images {begins} to {end}, and its annotations are "
                 f"of frames {first} to {last}: number them alike"
             )
         found = () if labels is None else (path for path in labels.arguments if isinstance(path, Path))
@@ -99,16 +101,12 @@ class ImageSequence:
             source_size=self.size,
             labels=labels,
             class_set=() if known is None else known.class_set,
-            attributes={**(attributes or {}), **self._unlike(known)},
+            attributes={
+                **(attributes or {}),  # labels beyond the images are no error, but the tables may say so
+                **({"annotated beyond": f"frame {last} of {end}"} if last > end else {}),
+            },
             files=(self.folder, *found),
         )
-
-    def _unlike(self, known: LabelTable | None) -> dict[str, str]:
-        """Labels of more frames than there are images are no error, but the tables may say so."""
-        last = self.first_number + self.frame_count - 1
-        if known is None or known.last_frame <= last:
-            return {}
-        return {"annotated beyond": f"frame {known.last_frame} of {last}"}
 
 
 def image_size(file: Path) -> tuple[int, int]:

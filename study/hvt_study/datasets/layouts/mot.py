@@ -34,7 +34,7 @@ from hvt_common.errors import UserError
 from hvt_common.files import read_text
 from hvt_common.inference.labels import read_labels
 from hvt_common.values import Boxes
-from hvt_study.datasets.annotation_rows import Rows, read_rows
+from hvt_study.datasets.annotation_rows import Rows, read_rows, usual_cells
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options, missing_labels
@@ -148,7 +148,7 @@ def _kinds(rows: Rows, highest: int, *, own: bool) -> tuple[Rows, npt.NDArray[np
 
 def _in_the_world(rows: Rows) -> bool:
     """Whether columns 8 to 10 are MOT15's ``x,y,z``; MOT16 and all after it have nine columns."""
-    return bool(rows.text) and len(rows.text[0].rstrip(",").split(",")) >= _MOT15_COLUMNS
+    return usual_cells(rows.text) == _MOT15_COLUMNS
 
 
 def _is_sequence(folder: Path) -> bool:

@@ -30,6 +30,7 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_study.datasets.annotation_rows import read_rows
+from hvt_study.datasets.class_map import VEHICLE
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels, video_table
 from hvt_study.datasets.labels import no_boxes, no_ids
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
@@ -37,7 +38,7 @@ from hvt_study.datasets.layouts.options import Options, missing_labels
 from hvt_study.datasets.sequence import Sequence
 
 _FPS = 30.0
-"""The dataset does not say; its drones filmed at 24 to 30."""
+"""The datasets do not say; VisDrone's drones filmed at 24 to 30."""
 _LAYOUT = "sequences/NAME/0000001.jpg and annotations/NAME.txt"
 
 
@@ -71,9 +72,7 @@ def _open(name: str, folder: Path, annotations: Path, options: Options) -> Seque
     return images.sequence(name=name, dataset="visdrone", fps=options.fps or _FPS, labels=labels)
 
 
-_UAVDT_FPS = 30.0
 _NAMES = ("car", "truck", "bus")
-_VEHICLE = "vehicle"
 _SEQUENCE = re.compile(r"M[0-9]{4}")
 _DEPTH = 3
 _ATTRIBUTES = (
@@ -112,7 +111,7 @@ def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
             np.isin(rows["category"], (1, 2, 3)), accepted="a category of 1 car, 2 truck or 3 bus in column 9"
         )
     kinds = np.zeros(len(rows), np.int64) if plain else rows["category"].astype(np.int64) - 1
-    names, every = (_VEHICLE,) if plain else _NAMES, np.ones(len(rows), np.bool_)
+    names, every = (VEHICLE,) if plain else _NAMES, np.ones(len(rows), np.bool_)
     return LabelTable.of(rows, every, kinds, names, ignored=_regions(ignore), size=size)
 
 
@@ -137,7 +136,7 @@ def _open_uavdt(name: str, folder: Path, texts: Mapping[str, Path], options: Opt
         ignore = texts.get(f"{name}_gt_ignore.txt", whole.with_name(f"{name}_gt_ignore.txt"))
         labels = TableLabels(uavdt_table, (whole, ignore, images.size), images.first_number)
     attributes = _attributes(texts.get(f"{name}_attr.txt"))
-    fps = options.fps or _UAVDT_FPS
+    fps = options.fps or _FPS
     return images.sequence(name=name, dataset="uavdt", fps=fps, labels=labels, attributes=attributes)
 
 
