@@ -56,7 +56,7 @@ def write_numbered(
     count: int = 60,
     *,
     pictures: Iterable[np.ndarray] | None = None,
-    rate: int = 30,
+    rate: int | Fraction = 30,
     codec: str = "libx264",
     times_ms: Iterable[int] | None = None,
     setup: Callable[[Any], None] = lambda _: None,

@@ -247,6 +247,7 @@ class _Reading:
     def __init__(self, container: Any, stream: Any) -> None:
         self._container, self._stream = container, stream
         self._size = _size_of(container)
+        self._begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)  # later FFmpeg guesses it
         self._damaged = self._shown_damaged = self._count = self._lossy = 0
         self._ended = ""
         self.end_s: Fraction | None = None
@@ -293,16 +294,17 @@ class _Reading:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
         if self._ends_in_fragment():
             return "its last fragment is cut"
-        count = self._frames_there()
-        if count < stream.frames and (self._lacks_bytes() or count < 0.98 * stream.frames - 2):
-            return f"{count} of its {stream.frames} frames are there"
+        count, said = self._frames_there(), stream.frames
+        if said and "mp4" in container.format.name:  # without what an edit list hides
+            said = len(stream.index_entries)
+        if count < said and (self._lacks_bytes() or count < 0.98 * said - 2):
+            return f"{count} of its {said} frames are there"
         if (why := self._lacks_pictures()) or container.format.name == "mpegts":
             return why
-        begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
         # The container's duration may be that of the sound.
         said_s = duration_s(stream) if stream.duration or len(container.streams) == 1 else None
         if said_s is not None and self.end_s is not None:
-            missing_s = said_s - (self.end_s - begin_s)
+            missing_s = said_s - (self.end_s - self._begin_s)
             if missing_s > 1 and missing_s > said_s / 50:
                 return f"it ends {float(missing_s):.1f} s before the end that its header says"
         return ""
