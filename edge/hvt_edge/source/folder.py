@@ -1,4 +1,4 @@
-"""A folder of numbered images as a source: VisDrone (0000001.jpg), UAVDT (img000001.jpg) and their like."""
+"""Images as a source: a folder of numbered ones, as VisDrone's (0000001.jpg) or UAVDT's, or one TIFF."""
 
 from __future__ import annotations
 
@@ -50,6 +50,11 @@ def names_picture(file: Path) -> bool:
     return file.suffix.lower() in _ENDINGS and not file.name.startswith(".")
 
 
+def is_tiff(spec: str) -> bool:
+    """Whether it is a file of that name: FFmpeg shows one that holds a JPEG black, and levels below 0 as high."""
+    return Path(spec).suffix.lower() in {".tif", ".tiff"} and Path(spec).is_file()
+
+
 def _natural(name: str) -> list[tuple[int, str]]:
     parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
@@ -66,8 +71,8 @@ def _gaps(files: list[Path]) -> str:
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
-def pages_of(file: Path) -> str:
-    """A note that a file holds more than one picture; empty where it does not."""
+def _pages(file: Path) -> str:
+    # A note that a file holds more than one picture; empty where it does not.
     count = 0
     with suppress(cv2.error):  # its header claims a size that no memory holds
         count = cv2.imcount(str(file))
@@ -85,7 +90,7 @@ class FolderSource(Source):
 
     def __init__(self, spec: str, settings: SourceSettings) -> None:
         self.fps = fps = settings.fps
-        self._files = sequence_files(Path(spec))
+        self._files = [Path(spec)] if is_tiff(spec) else sequence_files(Path(spec))
         if not self._files:
             endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
             raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
@@ -95,11 +100,11 @@ class FolderSource(Source):
         first, shown = next((one for one in images if one[0] is not None), (None, Path(spec)))
         if first is None:
             raise UserError(
-                f"source folder {spec!r} holds {len(self._files)} image files, none of which can be read"
+                f"source {spec!r} holds {len(self._files)} image files, none of which can be read"
             )
         if settings.source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
-        for said in (_gaps(self._files), pages_of(shown)):
+        for said in (_gaps(self._files), _pages(shown)):
             if said:
                 notes(said)
         self.notes = notes.taken()

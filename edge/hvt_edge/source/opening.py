@@ -19,7 +19,7 @@ from hvt_edge.source.coded_video import CodedVideoSource
 from hvt_edge.source.contract import BaseSize, Source, SourceSettings, check_shape
 from hvt_edge.source.decoding.container import is_local
 from hvt_edge.source.demo import DemoSource, is_demo
-from hvt_edge.source.folder import FolderSource
+from hvt_edge.source.folder import FolderSource, is_tiff
 from hvt_edge.source.live import LiveSource, patience_s
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber, is_description
 from hvt_edge.source.video import VideoSource
@@ -85,7 +85,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         _check_there(spec, scheme, growing=growing)
     if coded:
         return CodedVideoSource(spec, settings)
-    if not scheme and Path(spec).is_dir():
+    if not scheme and (Path(spec).is_dir() or is_tiff(spec)):
         return FolderSource(spec, settings)
     return VideoSource(spec, settings)
 

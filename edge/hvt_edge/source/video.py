@@ -7,7 +7,6 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import av
@@ -27,7 +26,6 @@ from hvt_edge.source.decoding.container import (
 )
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.decoding.timeline import Stamps
-from hvt_edge.source.folder import pages_of
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
 
@@ -111,8 +109,6 @@ class VideoSource(ClipSource):
 
     def _about_times(self, stream: Any) -> Iterator[str]:
         fps = float(1 / self._stamps.period_s)
-        if stream.container.format.name == "tiff_pipe" and (pages := pages_of(Path(self._spec))):
-            yield pages
         if self._override is not None:
             return
         if not self._stamps.usable:

@@ -111,11 +111,10 @@ def test_packets_that_a_recorder_lost_are_said(tmp_path, caplog):
     assert "a.ts lacks packets at 1 pictures" in caplog.text
 
 
-@pytest.mark.parametrize("source", [".", "0.tiff"])
-def test_of_a_file_of_many_pictures_it_is_said_that_one_is_shown(tmp_path, source):
+def test_of_a_file_of_many_pictures_it_is_said_that_one_is_shown(tmp_path):
     """A thermal recording of minutes, in one TIFF, was one picture, without a word."""
     cv2.imwritemulti(str(tmp_path / "0.tiff"), [numbered(0), numbered(1)])
-    with open_source(str(tmp_path / source), size=(320, 240), fps=1) as opened:
+    with open_source(str(tmp_path / "0.tiff"), size=(320, 240), fps=1) as opened:
         assert "0.tiff holds 2 pictures: of a file the first alone is shown" in " ".join(opened.notes)
 
 
