@@ -235,7 +235,11 @@ def _open(url: str, *, open_s: float, read_s: float) -> Any:
         if is_description(url):
             how["options"] = {**_OPTIONS, "protocol_whitelist": "file,udp,rtp"}
             return av.open(f"file:{url}", format="sdp", **how)
-        return av.open(url, **how)
+        container = av.open(url, **how)
+        if container.format.name != "mpjpeg" or container.streams.video[0].codec_context.width:
+            return container
+        container.close()
+        raise av.error.InvalidDataError(1, "no picture")
     except (av.error.FFmpegError, OSError, ValueError) as error:
         name, cause = redacted(url), cause_of(error)
         kind = UserError if isinstance(error, _NEVER) else NotYetError
@@ -247,7 +251,8 @@ def _open(url: str, *, open_s: float, read_s: float) -> Any:
             # FFmpeg reports no answer, or half of one, like this too: a camera that boots opens its port first.
             kind, cause = NotYetError, "no answer of RTSP in time"
         if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("http"):
-            # A camera's JPEGs without the boundary before the first: FFmpeg finds them by their own beginnings.
+            # Its JPEGs without the first boundary, as image/jpg, or of another length than it says: FFmpeg finds them
+            # by their own beginnings.
             with suppress(av.error.FFmpegError, OSError):
                 return _pictures_of(av.open(url, format="mjpeg", **how), name)
     raise kind(f"source {name} cannot be opened within {open_s:g} s ({cause}){_spelt(url)}")

@@ -15,7 +15,7 @@ from media.numbered import number_of, numbered
 
 @pytest.fixture
 def camera():
-    """Serves `numbered` pictures until it is closed; ``/whole`` with the first boundary, ``/cut`` without."""
+    """Serves `numbered` pictures until it is closed; ``/cut`` without the first boundary, ``/jpg`` of that kind."""
     stop = threading.Event()
 
     class Handler(BaseHTTPRequestHandler):
@@ -31,8 +31,9 @@ def camera():
             number = 0
             while not stop.wait(0.02):
                 data = cv2.imencode(".jpg", numbered(number % 1000))[1].tobytes()
-                head = f"Content-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n".encode()
-                between = b"--frame\r\n" if number or self.path == "/whole" else b""
+                form = "jpg" if self.path == "/jpg" else "jpeg"
+                head = f"Content-Type: image/{form}\r\nContent-Length: {len(data)}\r\n\r\n".encode()
+                between = b"--frame\r\n" if number or self.path != "/cut" else b""
                 try:
                     self.wfile.write(b"<html>" if self.path == "/page" else between + head + data + b"\r\n")
                 except OSError:
@@ -50,8 +51,8 @@ def camera():
     thread.join()
 
 
-@pytest.mark.parametrize("path", ["whole", "cut"])
-def test_a_camera_plays_with_or_without_its_first_boundary(camera, path):
+@pytest.mark.parametrize("path", ["whole", "cut", "jpg"])
+def test_a_camera_plays_whatever_its_boundaries(camera, path):
     """A camera that every browser shows would be refused."""
     with open_source(f"{camera}/{path}", size=(320, 240), fps=25, max_frames=5) as source:
         assert source.live
