@@ -229,7 +229,7 @@ def _reason(error: OSError) -> str:
     # In words; pyserial puts a number and the device into its own.
     if error.errno and error.errno > 0:
         return os.strerror(error.errno)
-    return re.sub(r"\[Errno \d+\] ", "", error.strerror or f"{error}") or type(error).__name__
+    return re.sub(r"\[Errno \d+\] |.*\(\d+, '|'\)$", "", error.strerror or f"{error}") or type(error).__name__
 
 
 MAX_FRAME_BYTES = 280

@@ -12,7 +12,7 @@ from hvt_edge.loop.pose import PoseSource
 from hvt_geo.pose.angles import compass_deg
 from hvt_geo.pose.files import read_poses
 
-_FILES = (".csv", ".srt", ".gpx", ".vtt")
+_FILES = (".csv", ".srt", ".gpx")
 
 
 def open_fixed(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) -> PoseSource:  # noqa: ARG001 - for all

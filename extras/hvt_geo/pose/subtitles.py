@@ -10,8 +10,8 @@ _FULL_FRAME_MM = 36.0
 """Width of the picture that 35 mm equivalent focal lengths are said for."""
 _OVERSHOT_DEG = 92.0
 """So far a gimbal's pitch goes where it means straight down or up."""
-_NUMBER = r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?"
-"""With a point, or with the comma that half of Europe writes."""
+_NUMBER = r"[+-]?\d++(?:[.,]\d++)?+(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d)"
+"""With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06'01"."""
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
 _NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}")

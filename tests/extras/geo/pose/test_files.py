@@ -165,6 +165,7 @@ def test_beyond_its_ends_and_in_a_gap_a_file_says_nothing(tmp_path):
             MINI.replace("00:00:00,000 -->", f"{'9' * 5000}:00:00,000 -->", 1).split("2\n00:")[0],
             "no row",
         ),
+        ("a.srt", "00:00:00,000 -->\nGPS(47°06'01\"N, 8°30'00\"E, 50m)\n", "no row"),
         ("a.srt", MINI.replace("00:00:01,000 -->", "9999:00:01,000 -->"), "time_s is 3.59964e"),
         (
             "a.srt",
@@ -201,7 +202,7 @@ def test_a_wrong_file_is_named_with_what_is_wrong(tmp_path, name, text, says):
         (f"mavlink:udpin:{'ä' * 70}:14550", "cannot be opened: this is no name of a host"),
         ("mavlink:udpin:a\0b:14550", "names no HOST:PORT"),
         ("mavlink:tcp:127.0.0.1:99999", "has the port 99999, accepted is 1 to 65535"),
-        ("mavlink:/dev/null", "cannot be opened"),
+        ("mavlink:/dev/null", "cannot be opened: Inappropriate ioctl"),
         ("mavlink:/dev/ttyACM0,fast", "has the baud rate 'fast', accepted is 50 to 4000000"),
         ("mavlink:/dev/ttyACM0," + "9" * 5000, "accepted is 50 to 4000000"),
     ],
