@@ -274,6 +274,4 @@ def _spelt(url: str) -> str:
     # How to write a password that was probably misread as part of the address; empty where there is none.
     body = url.partition("://")[2]
     odd = set("/?#[]") & set(body.rpartition("@")[0])
-    if not odd:
-        return ""
-    return "; in a password write / ? # [ ] as %2F %3F %23 %5B %5D"
+    return "; in a password write / ? # [ ] as %2F %3F %23 %5B %5D" if odd else ""

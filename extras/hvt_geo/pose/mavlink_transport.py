@@ -95,10 +95,7 @@ class Address:
             if self.kind == "tcp":
                 return _TcpStream(self.place, self.number, silent_s=silent_s)
             return _SerialDevice(self.place, self.number)
-        except (
-            UnicodeError,
-            TypeError,
-        ):  # a host that is no name of the domain name system; bind has a TypeError
+        except (UnicodeError, TypeError):  # no name of the domain name system; of bind the second
             raise OSError(0, "this is no name of a host") from None
         except (ValueError, termios.error) as error:  # of a serial device
             raise OSError(0, f"{error}") from None

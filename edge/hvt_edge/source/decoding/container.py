@@ -103,9 +103,7 @@ def open_video(
         # By its own name a file may look like an address.
         where: Any = f"file:{spec}" if local else spec
         file, options = where, _FILE_OPTIONS
-        if (
-            local and growing and spec.endswith(_PLAYLIST)
-        ):  # FFmpeg polls for more itself, for as long as the option allows
+        if local and growing and spec.endswith(_PLAYLIST):  # FFmpeg polls for more itself
             options = {**options, "m3u8_hold_counters": "1000"}
         elif local and growing:
             file = _GrowingFile(spec)
@@ -247,7 +245,7 @@ class _Reading:
     def __init__(self, container: Any, stream: Any) -> None:
         self._container, self._stream = container, stream
         self._size = _size_of(container)
-        self._begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)  # later FFmpeg guesses it
+        self._begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)  # guessed later
         self._damaged = self._shown_damaged = self._count = self._lossy = 0
         self._ended = ""
         self.end_s: Fraction | None = None

@@ -307,7 +307,7 @@ def test_sixteen_bit_pictures_of_a_folder_are_stretched_too(tmp_path):
 
 @pytest.mark.parametrize("unseen", [np.nan, np.inf, -np.inf, None])
 def test_pictures_of_degrees_are_stretched_too(tmp_path, unseen):
-    """Thermal converters write 32 bits (opencv#7025): they were called unreadable, or all black; one alone was still."""
+    """Thermal converters write 32 bits (opencv#7025): they were unreadable, or all black; one alone was still."""
     levels = heat().astype(np.float32) / 100 - 273.15
     if unseen is not None:
         levels[:9] = unseen
