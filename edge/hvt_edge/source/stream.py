@@ -20,7 +20,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_common.units import SECOND_NS
 from hvt_edge.source.contract import Notes
-from hvt_edge.source.decoding.container import DEMUX_OPTIONS, cause_of, choose_stream, is_local
+from hvt_edge.source.decoding.container import DEMUX_OPTIONS, WITHOUT_INDEX, cause_of, choose_stream, is_local
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 
@@ -80,8 +80,9 @@ class StreamGrabber:
 
     @property
     def holds_a_clip(self) -> bool:
-        """Whether the open stream has a known duration: a file behind an address, not a live stream."""
-        return bool(self._container.duration)
+        """Whether it has a known duration, or of MPEG-TS a size: a file behind an address, not a live stream."""
+        sized = self._container.format.name in WITHOUT_INDEX and self._container.size > 0
+        return sized or bool(self._container.duration)
 
     def restart(self) -> None:
         self.close()

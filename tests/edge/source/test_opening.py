@@ -394,11 +394,14 @@ class Live(BaseHTTPRequestHandler):
         """Answer with the recording."""
         self.send_response(200)
         self.send_header("Content-Type", "video/mp2t")
+        at_once = self.path == "/whole.ts"
+        if at_once:
+            self.send_header("Content-Length", str(len(self.stream)))
         self.end_headers()
         try:
             for start in range(0, len(self.stream), 188 * 8):
                 self.wfile.write(self.stream[start : start + 188 * 8])
-                time.sleep(0.01)
+                time.sleep(0 if at_once else 0.01)
         except OSError:
             return
 
@@ -440,6 +443,13 @@ def test_an_http_stream_plays_live_and_comes_back_after_it_ends(http_stream, cap
     assert frames[0].base_bgr.shape == (180, 320, 3)
     assert "source: http://127.0.0.1" in caplog.text
     assert not [thread for thread in threading.enumerate() if thread.name == "hvt-source"]
+
+
+def test_a_recording_that_a_server_sends_as_a_whole_is_a_clip(http_stream):
+    """It was a camera that sends in bursts and stops each time: a few pictures of each minute, over and over."""
+    with open_source(http_stream.replace("live", "whole"), size=(320, 180), fps=25) as source:
+        assert not source.live
+        assert len(list(source.frames(start_ns=0))) == 200
 
 
 @pytest.mark.parametrize("step_s", [-3600, 3600])

@@ -127,7 +127,8 @@ def test_a_camera_that_has_no_picture_yet_is_waited_for(monkeypatch, address, sa
     def answer(_url, *, format=None, **_settings):  # noqa: A002 - as PyAV has it
         if address.startswith("http") and format is None:
             raise av.error.InvalidDataError(1094995529, "Invalid data found when processing input")
-        return SimpleNamespace(streams=SimpleNamespace(video=()), duration=None, size=0, close=lambda: None)
+        of_kind = {"format": SimpleNamespace(name="rtsp"), "streams": SimpleNamespace(video=())}
+        return SimpleNamespace(**of_kind, duration=None, size=0, close=lambda: None)
 
     monkeypatch.setattr(av, "open", answer)
     with pytest.raises(NotYetError, match=says):
