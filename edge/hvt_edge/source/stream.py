@@ -45,7 +45,7 @@ _MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
 """A packet later or earlier than this sets the time for the next ones: after a stall, or a jump of the stamps."""
 _OPTIONS = {
     **DEMUX_OPTIONS,
-    "rtsp_transport": "tcp",  # over UDP a camera's keyframes lose packets on the first busy switch
+    "rtsp_flags": "prefer_tcp",  # by UDP, where a camera has no more, a busy switch loses packets of keyframes
     "fflags": "nobuffer",
     "flags": "low_delay",
     "analyzeduration": "2000000",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from itertools import pairwise
 
 import pytest
@@ -19,6 +20,15 @@ pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 def _installed() -> None:
     if reason := lacking():
         pytest.skip(reason)
+
+
+def test_a_camera_that_sends_by_udp_alone_is_shown(free_port):
+    """It was asked for TCP alone, and waited for till the flight was over."""
+    with ExitStack() as held:
+        camera = held.enter_context(GStreamerCamera(free_port, by="udp"))
+        source = held.enter_context(open_source(camera.url, size=SIZE, fps=25, max_frames=1))
+        (frame,) = source.frames(start_ns=0)
+    assert frame.base_bgr.max() > 200, "the ball, and no grey"
 
 
 @pytest.mark.parametrize(("codec", "end"), [("h264", "kill"), ("hevc", "kill"), ("h264", "hang")])

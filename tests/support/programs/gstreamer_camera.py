@@ -18,7 +18,7 @@ import sys
 import gi
 gi.require_version("Gst", "1.0")
 gi.require_version("GstRtspServer", "1.0")
-from gi.repository import GLib, Gst, GstRtspServer
+from gi.repository import GLib, Gst, GstRtsp, GstRtspServer
 Gst.init(None)
 """
 _CHECK = _IMPORTS + 'sys.exit(not all(map(Gst.ElementFactory.find, ("x264enc", "x265enc", "rtph265pay"))))'
@@ -27,6 +27,8 @@ _SERVE = (
     + """
 factory = GstRtspServer.RTSPMediaFactory(shared=True)
 factory.set_launch(sys.argv[2])
+if sys.argv[3] == "udp":
+    factory.set_protocols(GstRtsp.RTSPLowerTrans.UDP)
 server = GstRtspServer.RTSPServer(address="127.0.0.1", service=sys.argv[1])
 server.get_mount_points().add_factory("/camera", factory)
 if not server.attach(None):
@@ -52,14 +54,14 @@ def lacking() -> str:
 
 
 class GStreamerCamera:
-    """A moving ball in ``h264`` or ``hevc``, a keyframe each second."""
+    """A moving ball in ``h264`` or ``hevc``, a keyframe each second; ``by`` UDP alone, or as the viewer asks."""
 
-    def __init__(self, port: int, *, codec: str = "h264") -> None:
+    def __init__(self, port: int, *, codec: str = "h264", by: str = "") -> None:
         self.url = f"rtsp://127.0.0.1:{port}/camera"
         picture = f"video/x-raw,format=I420,width={SIZE[0]},height={SIZE[1]},framerate={FPS}/1"
         launch = f"( videotestsrc is-live=true pattern=ball ! {picture} ! {_CODERS[codec]} name=pay0 pt=96 )"
         self._process = subprocess.Popen(
-            [_PYTHON, "-c", _SERVE, str(port), launch],
+            [_PYTHON, "-c", _SERVE, str(port), launch, by],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
