@@ -19,6 +19,7 @@ from hvt_common.runtime.log import START_LOGGER
 from hvt_common.runtime.plug_ins import health_server
 from hvt_common.runtime.process import give_back_holes, notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
+from hvt_common.transport.zenoh_config import configure
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.config import EdgeConfig, check_rate
@@ -39,6 +40,7 @@ from hvt_edge.wiring import (
     check_codecs,
     check_files,
     check_store,
+    make_link_settings,
     open_for_flight,
     qualify_encoder,
     say_size,
@@ -88,6 +90,7 @@ class Edge:
         """
         config, world = self._config, self._world
         check_files(config)
+        configure(make_link_settings(config))  # a wrong endpoint is said before models are open
         check_codecs(config)
         with ExitStack() as stack:
             if config.metrics is not None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import pytest
 
+from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector
 from hvt_common.values import Detections, Frame, Image
 from hvt_edge.app import Edge
@@ -92,6 +93,16 @@ def test_video_alone_opens_no_detector(tmp_path, pace, settings, opened):
     assert world.opened == opened
     assert summary["frames"] > 0
     assert not summary.get("failed")
+
+
+def test_a_wrong_endpoint_is_refused_before_a_model_is_opened(tmp_path):
+    """A board opens its models for half a minute, and then said what was wrong with the command."""
+    write_scene(tmp_path, frames=1)
+    config = EdgeConfig(source=str(tmp_path), source_fps=1.0, connect=("tcp/127.0.0.1",), method="M2")
+    world = CountingWorld()
+    with pytest.raises(UserError, match="is not usable: PROTOCOL"):
+        Edge(check(config), stop=threading.Event(), world=world).run()
+    assert world.opened == 0
 
 
 class FragileDetector(Detector):
