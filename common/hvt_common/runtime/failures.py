@@ -95,10 +95,11 @@ class Failures:
             if not (one.working or one.over)
         )
 
-    def failed(self, part: str, reason: str) -> int:
+    def failed(self, part: str, reason: str, *, last: bool = False) -> int:
         """It has stopped, for the how manieth time. The log says so once, however often it is tried in vain.
 
         The ground, who watches the process and the summary are told the reason, without secrets of an address.
+        ``last``: it ends, and is not tried again.
         """
         reason = _REDACTION.text(reason)
         now_ns = self._clock()
@@ -111,7 +112,8 @@ class Failures:
         if anew and (before is None or now_ns - before.failed_ns > _STEADY_NS or count.bit_count() == 1):
             self._said.add(part)
             times = "" if count == 1 else f" ({count} failures so far)"
-            _log.warning("%s: %s; all else goes on, and it is tried again%s", part, reason, times)
+            again = "" if last else ", and it is tried again"
+            _log.warning("%s: %s; all else goes on%s%s", part, reason, again, times)
         return count
 
     def over(self, part: str, count: int) -> None:

@@ -15,7 +15,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from hvt_common.errors import FOREIGN
+from hvt_common.errors import FOREIGN, UserError
 from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
@@ -158,7 +158,7 @@ class QueuedSink(Generic[T]):
         self._hurry.set()
         self._thread.join(1.0)
         if not self.ended:
-            self._fail(TimeoutError("it did not end in time"))
+            self._fail(UserError("it did not end in time, and what it had yet to write is lost"))
         return self.ended
 
     @property
@@ -288,7 +288,7 @@ class QueuedSink(Generic[T]):
             self._changed.notify_all()
         for done in lost:
             done(False)
-        self._failed = self._failures.failed(self.part, reason_of(error))
+        self._failed = self._failures.failed(self.part, reason_of(error), last=self._ending)
         _log.debug("%s failed", self.part, exc_info=error)
 
 

@@ -100,7 +100,7 @@ def test_one_that_waits_for_a_keyframe_has_it_asked_for_once():
     sink.close()
 
 
-def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path):
+def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path, caplog):
     """Ctrl-C would be answered with kill -9."""
     pipe = tmp_path / "table.csv"
     os.mkfifo(pipe)
@@ -110,6 +110,8 @@ def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path):
     outputs.close(within_s=0.1)
     assert not sink.ended
     assert [(one.part, one.working) for one in failures.parts] == [("tracks table", False)]
+    said = "tracks table: it did not end in time, and what it had yet to write is lost; all else goes on"
+    assert said in caplog.messages, "it is not tried again"
     with pipe.open():  # so that the test's own process has no thread left
         eventually(lambda: sink.ended, what="the thread ends")
 
