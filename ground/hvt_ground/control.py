@@ -216,7 +216,7 @@ class RemoteEdge:
         info = self.info()
         inbox = Inbox(capacity=_INBOX_MESSAGES)
         subscribers = [
-            subscribe(self._session, self._keys.key(channel), inbox=inbox)
+            subscribe(self._session, self._keys.key(channel), put=inbox.put)
             for channel in (Channel.ROI, Channel.STATUS)
         ]
         try:

@@ -121,7 +121,7 @@ def test_the_ledger_agrees_with_the_kernel_on_loopback(namespaces):
 def listen(endpoint: str) -> None:
     """Subscribe until told to stop."""
     with open_session(LinkSettings("ground", listen=(endpoint,), insecure=True)) as session:
-        subscriber = subscribe(session, "hvt/*/base", inbox=Inbox(capacity=1))
+        subscriber = subscribe(session, "hvt/*/base", put=Inbox(capacity=1).put)
         print("up", flush=True)
         sys.stdin.readline()
         subscriber.undeclare()

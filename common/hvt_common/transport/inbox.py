@@ -9,7 +9,6 @@ import threading
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import Protocol
 
 from hvt_common.units import SECOND_NS
 
@@ -31,13 +30,6 @@ class Received:
     @property
     def size_bytes(self) -> int:
         return len(self.payload) + len(self.attachment)
-
-
-class ReceivedQueue(Protocol):
-    """Takes messages from Zenoh's callbacks; must never block."""
-
-    def put(self, item: Received) -> None:
-        """Take one message."""
 
 
 class Inbox:

@@ -21,7 +21,7 @@ import zenoh
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, EdgeKeys
 from hvt_common.runtime.failures import Awaited, Failures
-from hvt_common.transport.inbox import Received, ReceivedQueue
+from hvt_common.transport.inbox import Received
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.stale_sockets import StaleSockets, end_of, ends_of, listening_ends
 from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
@@ -128,11 +128,11 @@ def subscribe(
     session: zenoh.Session,
     key_expr: str,
     *,
-    inbox: ReceivedQueue,
+    put: Callable[[Received], None],
     clock: Callable[[], int] = time.time_ns,
     on_error: Callable[[str, Exception], None] | None = None,
 ) -> zenoh.Subscriber[None]:
-    """Copy every message of the key expression into the inbox, with its time by ``clock``; deletions are ignored.
+    """``put``, which never blocks, gets every message of the key expression with its time by ``clock``; no deletions.
 
     ``on_error(key, error)`` gets the exception of a message, which Zenoh would print and forget.
     """
@@ -150,7 +150,7 @@ def subscribe(
         if sample.kind != zenoh.SampleKind.PUT:
             return
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        inbox.put(
+        put(
             Received(
                 key=str(sample.key_expr),
                 payload=sample.payload.to_bytes(),

@@ -72,8 +72,8 @@ class EdgePort:
         """Set while the edge's liveliness token is there."""
         self.used = threading.Event()
         """Set while there is more to this edge than messages under its name: a session that is open."""
-        self.received_ns = 0
-        """When its newest message came; 0 before the first."""
+        self.reported_ns = 0
+        """When its newest report came; 0 before the first."""
         self._unanswered = self._unusable = 0
         self._version_said = False
         self._keys = EdgeKeys(self.edge)
@@ -140,9 +140,10 @@ class EdgePort:
 
     def put(self, item: Received, row: Channel) -> None:
         """Take a message in, or drop it: without room, or where an edge reports without end."""
-        self.received_ns = item.received_ns
-        if row == Channel.STATUS and not self._reports.take(item.received_ns):
-            return
+        if row == Channel.STATUS:
+            self.reported_ns = item.received_ns
+            if not self._reports.take(item.received_ns):
+                return
         if self.log is not None:
             self.log(item)
         self.inbox.put(item)

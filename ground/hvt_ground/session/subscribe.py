@@ -6,6 +6,7 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Self
 
 import zenoh
@@ -33,17 +34,6 @@ _SUBSCRIBED = (
     *(Channel.BASE, Channel.ROI, Channel.TRACKS),
     *(Channel.POSE, Channel.BACKLOG, Channel.STATUS),
 )
-
-
-class _General:
-    """Takes messages by the subscriptions of all edges, but for edges that have their own."""
-
-    def __init__(self, link: GroundLink) -> None:
-        self._link = link
-
-    def put(self, item: Received) -> None:
-        if not self._link.has_own(item.key):
-            self._link.put(item)
 
 
 class GroundLink:
@@ -75,7 +65,8 @@ class GroundLink:
         self._unplaced: set[str] = set()
         """Edges that show their token and found no place; the first `MAX_EDGES` of them."""
         self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
-        """Subscriptions by edge: all with a group, else those of edges that did not hear of the general ones."""
+        """Subscriptions by edge: all with a group, else those of edges that may not have heard of the general ones.
+        The newest six count; an edge may know no others than those before."""
         self._quiet: dict[str, RetryPause] = {}
         """By edge that is there, until its subscriptions are made again."""
         self._again = Counter[str]()
@@ -90,8 +81,7 @@ class GroundLink:
         """Messages under keys that are none of ours, or of more edges than are served."""
         self._refused = False
         for row in () if group else _SUBSCRIBED:
-            key_expr = selector(row, edges=edges)
-            subscribe(session, key_expr, inbox=_General(self), clock=self._clock, on_error=self._fail)
+            self._declare(selector(row, edges=edges), number=-1)
         self._presence = session.liveliness().declare_subscriber(
             selector(Channel.ALIVE, edges=edges), self._on_presence, history=True
         )
@@ -111,11 +101,6 @@ class GroundLink:
                 self._subscribe_again(port)
         return ports
 
-    def has_own(self, key: str) -> bool:
-        """Whether a message comes by a subscription of its edge as well."""
-        parsed = parse_key(key)
-        return parsed is not None and parsed[0] in self._subscribers
-
     def closed(self, port: EdgePort) -> None:
         """The last session of a port that had left is closed: with a group another member may serve the edge."""
         if self._group is not None:
@@ -126,12 +111,6 @@ class GroundLink:
         """Whether this edge has shown itself, by its token or a message."""
         with self._lock:
             return edge in self._ports or edge in self._alive
-
-    def put(self, item: Received) -> None:
-        parsed = self._parsed(item.key)
-        port = None if parsed is None else self._port(parsed[0])
-        if port is not None and parsed is not None:
-            port.put(item, parsed[1])
 
     def __enter__(self) -> Self:
         return self
@@ -161,38 +140,47 @@ class GroundLink:
             return
         if edge in self._alive:
             port.present.set()
-        self._subscribe(edge)
+        self._subscribe(edge, 0)
 
-    def _subscribe(self, edge: str) -> None:
-        # First the new, then without the old: an edge that hears both sends on all the while.
-        former, keys, number = self._subscribers.get(edge, []), EdgeKeys(edge), self._again[edge]
-        self._subscribers[edge] = [
-            subscribe(
-                self._session,
-                another_key(keys.key(row), row, number=number),
-                inbox=self,
-                clock=self._clock,
-                on_error=self._fail,
-            )
+    def _subscribe(self, edge: str, number: int) -> None:
+        # First the new, then without those before the last: of the new ones some may be lost, and what withdraws the
+        # old ones arrive.
+        former, keys = self._subscribers.get(edge, []), EdgeKeys(edge)
+        new = [
+            self._declare(another_key(keys.key(row), row, number=number), number=number)
             for row in _SUBSCRIBED
         ]
-        for one in former:
+        self._again[edge] = number
+        self._subscribers[edge] = new + former[: len(new)]
+        for one in former[len(new) :]:
             one.undeclare()  # type: ignore[no-untyped-call]
 
+    def _declare(self, key_expr: str, *, number: int) -> zenoh.Subscriber[None]:
+        put = partial(self._put, number=number)
+        return subscribe(self._session, key_expr, put=put, clock=self._clock, on_error=self._fail)
+
+    def _put(self, item: Received, *, number: int) -> None:
+        # What comes by the newest subscriptions of its edge, or by those of all edges (-1) where it has none.
+        parsed = self._parsed(item.key)
+        if parsed is None or number != (self._again[parsed[0]] if parsed[0] in self._subscribers else -1):
+            return
+        port = self._port(parsed[0])
+        if port is not None:
+            port.put(item, parsed[1])
+
     def _subscribe_again(self, port: EdgePort) -> None:
-        # Once in any case, for one channel's may be lost alone; then while nothing comes from an edge that is there,
-        # which reports each second if it knows that somebody listens. Zenoh withdraws the token of one that does not.
+        # Twice in any case: those of one channel may be lost alone. Then while no report comes from an edge that is
+        # there, as each second if it knows who listens to it and its video. Zenoh withdraws the token of another.
         now_ns, edge, there = self._clock(), port.edge, port.present.is_set()
-        if port.received_ns and not there:
+        if port.reported_ns and not there:
             self._quiet.pop(edge, None)
             return
         pause = self._quiet.setdefault(edge, RetryPause(_QUIET_NS, _MOST_QUIET_NS))
-        silent = now_ns - port.received_ns >= _QUIET_NS
+        silent = now_ns - port.reported_ns >= _QUIET_NS
         tries = silent and (there or pause.pause_ns < _MOST_QUIET_NS)
-        if pause.due(now_ns) and (tries or pause.pause_ns <= _QUIET_NS):
+        if pause.due(now_ns) and (tries or pause.pause_ns <= 2 * _QUIET_NS):
             if pause.pause_ns:
-                self._again[edge] += 1
-                self._subscribe(edge)
+                self._subscribe(edge, self._again[edge] + 1)
             pause.failed(now_ns)
 
     def _leave(self, edge: str) -> None:

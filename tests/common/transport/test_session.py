@@ -66,7 +66,7 @@ def test_messages_cross_with_attachment_and_encoding(endpoint):
     """Nothing would arrive, or without what HVT knows about it."""
     inbox = Inbox(capacity=8)
     with open_session(ground(endpoint)) as listener, open_session(edge(endpoint)) as connector:
-        subscriber = subscribe(listener, selector(Channel.BASE, edges="uav-*"), inbox=inbox)
+        subscriber = subscribe(listener, selector(Channel.BASE, edges="uav-*"), put=inbox.put)
         publisher = declare_publisher(connector, Channel.BASE, keys=KEYS)
         other = declare_publisher(connector, Channel.BASE, keys=EdgeKeys("rover-1"))
         eventually(lambda: publisher.matching_status.matching)
@@ -92,7 +92,7 @@ def test_the_edge_may_start_first(endpoint):
         inbox = Inbox(capacity=8)
         for _ in range(2):  # and the ground may come and go
             with open_session(ground(endpoint)) as listener:
-                subscriber = subscribe(listener, selector(Channel.BASE), inbox=inbox)
+                subscriber = subscribe(listener, selector(Channel.BASE), put=inbox.put)
                 eventually(lambda: publisher.matching_status.matching)
                 publisher.put(b"heard")
                 assert inbox.get(timeout_s=60).payload == b"heard"
@@ -242,7 +242,7 @@ def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
     """Answers would wait behind pictures although two links were asked for, or a row would be lost between them."""
     with open_session(ground(endpoint)) as listener:
         inbox = Inbox(capacity=64)
-        subscriber = subscribe(listener, "hvt/uav-1/*", inbox=inbox)
+        subscriber = subscribe(listener, "hvt/uav-1/*", put=inbox.put)
         with open_session(LinkSettings("edge", connect=(endpoint,), links=2)) as connector:
             queryable = serve(connector, Channel.INFO, keys=KEYS, answer=lambda question: question)
             eventually(lambda: all(len(session.info.links()) == 2 for session in (connector, listener)))
@@ -383,7 +383,7 @@ LISTENER = """
     from hvt_common.protocol.channels import *
     with open_session(LinkSettings("ground", listen=(sys.argv[1],))) as session:
         inbox = Inbox(capacity=8)
-        subscriber = subscribe(session, selector(Channel.BASE), inbox=inbox)
+        subscriber = subscribe(session, selector(Channel.BASE), put=inbox.put)
         print("up", flush=True)
         time.sleep(120)
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import zlib
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -11,8 +12,12 @@ import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import WIRE_VERSION, Feedback, Message
+from hvt_common.runtime.failures import Failures
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_edge.link import publisher
+from programs.processes import eventually
 from rigs.messages import ANSWER, FEEDBACK, INFO_REQUEST, REQUEST
 
 
@@ -118,3 +123,29 @@ def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
     assert (after(1, there=False), after(3, there=True)) == ((0, 0, 0), (1, 1, 1)), (
         "another, or on another way"
     )
+
+
+def test_a_ground_that_lacks_the_video_gets_no_report_over_udp(free_port):
+    """It took the edge for subscribed to, and asked no more: a jittery link kept a whole flight without a picture."""
+    place, came = (f"udp/127.0.0.1:{free_port}",), []
+    answers = publisher.Answers(
+        info=lambda _received_ns: b"", control=lambda _request: ANSWER, on_feedback=lambda _feedback: None
+    )
+    with (
+        open_session(LinkSettings("ground", listen=place)) as ground,
+        publisher.ZenohLink(
+            LinkSettings("edge", connect=place),
+            edge_id="uav-1",
+            failures=Failures(time.time_ns),
+            clock=time.time_ns,
+        ) as link,
+    ):
+        link.listen(answers)
+        for number, channel in enumerate((Channel.STATUS, Channel.BASE)):
+            ground.declare_subscriber(
+                f"hvt/uav-1/{channel}", lambda sample: came.append(sample.payload.to_bytes())
+            )
+            eventually(lambda channel=channel: link.has_subscriber(channel))
+            link.put(Channel.STATUS, bytes((number,)))
+        eventually(lambda: came)
+    assert came == [b"\1"]
