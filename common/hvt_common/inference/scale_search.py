@@ -11,6 +11,7 @@ docs/embedded-models.md.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -28,8 +29,9 @@ _OVERLAP: Final = 0.05
 """Of two neighbouring parts: objects in enlarged parts are small."""
 _MOST_SIDE: Final = 1280
 """A larger picture is searched at the scale of its pixels already (`hvt_common.inference.tiles`)."""
-_FIRST, _EVERY = 3, 45
-"""The first 3 pictures are probed, then every 45th."""
+_FIRST, _APART, _EVERY = 3, 3, 45
+"""The second picture is probed, the fifth and the eighth, then every 45th: a slow machine measures by its first
+pictures how often it can search, and a probe takes as long as three of them."""
 _OTHER: Final = 2.0
 """Twice or half as many promised as at the last probe: another scene, which is probed at once."""
 _MORE, _LEAST_MORE = 3.0, 8.0
@@ -57,7 +59,7 @@ class ScaleSearch:
         self._detect = detect
         self._confidence = confidence
         self._pictures = self._probes = self._in_vain = 0
-        self._due, self._before = 1, 0.0
+        self._due, self._before = 2, math.inf
         self._large = True
         """The picture before surely showed something large, or there was none."""
         self.enlarged = False
@@ -81,7 +83,9 @@ class ScaleSearch:
             return found
         promised = self._promise(whole)
         low, high = sorted((promised, self._before))
-        if self._pictures >= self._due or high > _OTHER * low + _LEAST_MORE:
+        if math.isinf(high):
+            self._before = promised
+        elif self._pictures >= self._due or high > _OTHER * low + _LEAST_MORE:
             self._before = promised
             self._probe(whole, image_bgr, tiles[self._probes % len(tiles)])
         return whole
@@ -99,7 +103,7 @@ class ScaleSearch:
     def _probe(self, whole: Detections, image_bgr: Image, tile: Tile) -> None:
         x1, y1, x2, y2 = tile
         self._probes += 1
-        self._due = self._pictures + (1 if self._probes < _FIRST else _EVERY)
+        self._due = self._pictures + (_APART if self._probes < _FIRST else _EVERY)
         middles = (whole.boxes_xyxy_px[:, :2] + whole.boxes_xyxy_px[:, 2:]) / 2
         inside = (middles >= (x1, y1)) & (middles < (x2, y2))
         here = self._promise(whole, inside[:, 0] & inside[:, 1])

@@ -86,13 +86,15 @@ def test_small_objects_are_looked_at_enlarged_and_less_often(candidates):
 
 @pytest.mark.parametrize(
     ("tiles", "pace", "runs"),
-    [("auto", "realtime", 2), ("auto", "lockstep", 1), ("search", "lockstep", 2), ("off", "realtime", 1)],
+    [("auto", "realtime", 3), ("auto", "lockstep", 2), ("search", "lockstep", 3), ("off", "realtime", 2)],
 )
 def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, runs):
     """Objects of a few pixels would get no still, or a study that is repeated other figures."""
     config = check(EdgeConfig(source="demo", candidates="source", tiles=tiles, pace=pace))
     network = NothingSeen()
-    make_analyzer(config, detector=network, view=VIEW).analyze(FRAMES[0], UNITS[0])
+    analyzer = make_analyzer(config, detector=network, view=VIEW)
+    for frame, unit in zip(FRAMES[:6], UNITS, strict=False):
+        analyzer.analyze(frame, unit)
     assert network.runs == runs
 
 

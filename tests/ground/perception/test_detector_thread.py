@@ -100,7 +100,7 @@ def test_a_picture_that_nobody_wants_any_more_is_not_searched_and_an_error_ends_
 
 @pytest.mark.parametrize(
     ("tiles", "pace", "runs"),
-    [("auto", "realtime", 2), ("auto", "lockstep", 1), ("search", "lockstep", 2), ("off", "realtime", 1)],
+    [("auto", "realtime", 3), ("auto", "lockstep", 2), ("search", "lockstep", 3), ("off", "realtime", 2)],
 )
 def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, runs):
     """Objects of a few pixels would have no box, or a study that is repeated other figures."""
@@ -108,6 +108,7 @@ def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, run
     models.take = lambda: (network, None)
     config, info = check(GroundConfig(classifier="none", tiles=tiles)), replace(Flight(1).info(), pace=pace)
     pipeline = SessionPerception(config, models, info).pipeline(lambda _: None)
-    pipeline.analyze(DecodedFrame(0, 0, 0, PICTURE), hurry=False)
+    for index in (0, 100):
+        pipeline.analyze(DecodedFrame(index, 0, 0, PICTURE), hurry=False)
     assert network.runs == runs
     eventually(lambda: not models.loading, what="the models are loaded: no process ends meanwhile")
