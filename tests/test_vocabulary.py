@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import tokenize
@@ -74,6 +75,27 @@ def test_words_that_went_stay_away():
                 said = said.replace(name, "")
             found += [f"{file}:{number}: {match[0]}" for match in _NEVER.finditer(said)]
     assert not found, f"{len(found)} words that shared terms replace:\n" + "\n".join(found)
+
+
+def _prose(file: str) -> Iterator[str]:
+    # Docstrings, also those behind constants and fields, and comments.
+    source = (ROOT / file).read_text(encoding="utf-8")
+    yield from (match[0] for match in re.finditer(r"(^|  )# .*", source, re.MULTILINE))
+    for node in ast.walk(ast.parse(source)) if "what" in source else ():
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            yield str(node.value.value)
+
+
+def test_prose_names_its_things():
+    """ "What came of what was left" is a riddle: a noun says which thing is meant."""
+    packages = [f"{one}/*.py" for one in ("common", "edge", "ground", "extras", "study", "lab", "bench")]
+    found = [
+        f"{file}: {text}"
+        for file in _tracked(*packages)
+        for text in _prose(file)
+        if re.search(r"\bwhat\b", text, re.IGNORECASE)
+    ]
+    assert len(found) <= 20, "say which thing, not what:\n" + "\n".join(found)
 
 
 def test_names_are_terms_of_the_field():
