@@ -97,7 +97,7 @@ def parse_limit(text: str, *, name: str) -> Limit:
 
 
 def parse_age_s(text: str, *, name: str, also: str = "") -> float:
-    """``14days`` → seconds; ``also``: what else is accepted, for the sentence."""
+    """``14days`` → seconds; ``also``: other accepted forms, for the sentence."""
     with suppress(UserError):
         seconds = parse_limit(text, name=name).seconds
         if seconds is not None:

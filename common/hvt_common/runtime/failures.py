@@ -28,7 +28,7 @@ _STEADY_PAUSES = 10
 
 
 def reason_of(error: BaseException) -> str:
-    """An error in one line: a sentence, or what a database says, as it is; anything else after its kind."""
+    """An error in one line: a sentence or a database's message as it is; anything else after its kind."""
     said = isinstance(error, UserError) or type(error).__module__ == "sqlite3"
     text = str(error) if said else f"{type(error).__name__}: {error}"
     return " ".join(text.split())[:300]

@@ -143,8 +143,8 @@ class GroundLink:
         self._subscribe(edge, 0)
 
     def _subscribe(self, edge: str, number: int) -> None:
-        # First the new, then without those before the last: of the new ones some may be lost, and what withdraws the
-        # old ones arrive.
+        # Make new ones first, and keep the last ones: declarations of the new may be lost on the way, while the
+        # withdrawal of the old arrives.
         former, keys = self._subscribers.get(edge, []), EdgeKeys(edge)
         new = [
             self._declare(another_key(keys.key(row), row, number=number), number=number)
@@ -160,7 +160,7 @@ class GroundLink:
         return subscribe(self._session, key_expr, put=put, clock=self._clock, on_error=self._fail)
 
     def _put(self, item: Received, *, number: int) -> None:
-        # What comes by the newest subscriptions of its edge, or by those of all edges (-1) where it has none.
+        # Takes messages of an edge's newest subscriptions, or of those of all edges (-1) where it has none.
         parsed = self._parsed(item.key)
         if parsed is None or number != (self._again[parsed[0]] if parsed[0] in self._subscribers else -1):
             return

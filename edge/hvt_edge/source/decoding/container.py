@@ -293,7 +293,7 @@ class _Reading:
         if self._ends_in_fragment():
             return "its last fragment is cut"
         count, said = self._frames_there(), stream.frames
-        if said and "mp4" in container.format.name:  # without what an edit list hides
+        if said and "mp4" in container.format.name:  # without frames hidden by an edit list
             said = len(stream.index_entries)
         if count < said and (self._lacks_bytes() or count < 0.98 * said - 2):
             return f"{count} of its {said} frames are there"
