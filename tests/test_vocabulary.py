@@ -87,7 +87,7 @@ def _prose(file: str) -> Iterator[str]:
 
 
 def test_prose_names_its_things():
-    """ "What came of what was left" is a riddle: a noun says which thing is meant."""
+    """A sentence about what came of what was left is a riddle: a noun says which thing is meant."""
     packages = [f"{one}/*.py" for one in ("common", "edge", "ground", "extras", "study", "lab", "bench")]
     found = [
         f"{file}: {text}"

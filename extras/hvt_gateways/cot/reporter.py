@@ -144,7 +144,7 @@ class SessionReporter(SinkWriter[Event]):
             self._send(self._event_of(track, motion, made_ns=made_ns, age_ns=age_ns))
 
     def _event_of(self, track: PlacedTrack, motion: Motion | None, *, made_ns: int, age_ns: int) -> CotEvent:
-        still = self._stills.get(track.track_id, "") if track.refined else ""  # else of an object there before
+        still = self._stills.get(track.track_id, "") if track.refined else ""  # of its own object
         return CotEvent(
             uid=f"{self._track_uid}-{track.track_id}",
             type=self._types.of_class(track.name),
