@@ -232,13 +232,14 @@ class OnnxDetector:
         )
         return f"{self.preparation}, {how}{', channels last' if self._channels_last else ''}"
 
-    def detect(self, image_bgr: Image) -> Detections:
+    def detect(self, image_bgr: Image, *, share: float = 1.0) -> Detections:
         """Run the network on one (height, width, 3) uint8 image of any size; grey is accepted too.
 
+        ``share`` is as of `input_size`.
         Raises `UserError` where it does not run, or no number comes out: that is no picture without objects.
         """
         image = as_bgr(image_bgr)
-        input_size = self.input_size((image.shape[1], image.shape[0]))
+        input_size = self.input_size((image.shape[1], image.shape[0]), share=share)
         tensor, letterbox = self._letterboxer.fill(image, input_size)
         least = min(self._confidence, WEAK) if self._averages else self._confidence
         outputs = self._run(tensor)
@@ -284,12 +285,12 @@ class OnnxDetector:
         inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & named
         return Detections(boxes[inside], scores[inside], class_ids[inside])
 
-    def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
+    def input_size(self, image_size: tuple[int, int], *, share: float = 1.0) -> tuple[int, int]:
         """(width, height) in pixels that the network gets for an image of this (width, height).
 
         A network that was trained for small objects may want small images enlarged (``hvt.enlarge_to`` in its
         metadata): on a base stream of 640x360 a car is six pixels long, and lies within one cell. One that says the
-        side that it was trained at (``imgsz``) gets that side.
+        side that it was trained at (``imgsz``) gets that side. A ``share`` of these sides is for slow machines.
         """
         if self._fixed_size is not None:
             return self._fixed_size
@@ -298,7 +299,7 @@ class OnnxDetector:
         scale = min(wanted / longest, _MOST_ENLARGED) if wanted else 1.0
         if not self._trained_at or self._enlarge_to:
             scale = max(1.0, scale)
-        scale = min(scale, _MAX_FREE_SIDE / longest)
+        scale = min(scale, _MAX_FREE_SIDE / longest) * share
         cell = self._cells[0]
         width, height = (-int(-side * scale // cell) * cell for side in image_size)
         return max(width, cell), max(height, cell)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar, cast
 
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import Detector
+from hvt_common.inference.detect import Detector, FailingDetector
 from hvt_common.inference.tiles import detect_whole
 from hvt_common.runtime.failures import Failures, Retried
 from hvt_common.values import Detections, Image, Posterior
@@ -41,8 +42,19 @@ class RetriedDetector(_RetriedModel[Detector]):
     def detect(self, image_bgr: Image) -> Detections | None:
         return self.run(lambda model: model.detect(image_bgr))
 
-    def detect_whole(self, image_bgr: Image) -> Detections | None:
-        return self.run(lambda model: detect_whole(model, image_bgr))
+    def detect_whole(self, image_bgr: Image, *, share: float = 1.0) -> Detections | None:
+        return self.run(lambda model: detect_whole(model, image_bgr, share=share))
+
+
+class _Whole(Protocol):
+    def __call__(self, image_bgr: Image, *, share: float = 1.0) -> Detections | None: ...
+
+
+def without_tiles(detector: FailingDetector) -> _Whole:
+    """`detect_whole` of a detector, which may be one that is opened again."""
+    if isinstance(detector, RetriedDetector):
+        return detector.detect_whole
+    return partial(detect_whole, cast("Detector", detector))
 
 
 class RetriedClassifier(_RetriedModel[Classifier]):

@@ -61,6 +61,7 @@ _ACROSS: Final = 0.7
 @runtime_checkable
 class _Sized(Protocol):
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]: ...
+    def detect(self, image_bgr: Image, *, share: float = 1.0) -> Detections: ...
 
 
 def parse_tiles(text: str) -> Grid | Literal["auto", "off"]:
@@ -138,12 +139,14 @@ def tile_boxes(source_size: tuple[int, int], grid: Grid, *, overlap: float = OVE
     return [(x, y, x + sides[0], y + sides[1]) for y in starts[1] for x in starts[0]]
 
 
-def detect_whole(detector: Detector, image_bgr: Image) -> Detections:
-    """Detect in the whole picture, without the tiles that `tiled` may have given it."""
+def detect_whole(detector: Detector, image_bgr: Image, *, share: float = 1.0) -> Detections:
+    """Detect in the whole picture, without the tiles that `tiled` may have given it.
+
+    A network whose input may have any size gets one with a ``share`` of its sides.
+    """
+    one = detector.whole if isinstance(detector, TiledDetector) else detector
     return (
-        detector.detect_whole(image_bgr)
-        if isinstance(detector, TiledDetector)
-        else detector.detect(image_bgr)
+        one.detect(image_bgr, share=share) if share < 1 and isinstance(one, _Sized) else one.detect(image_bgr)
     )
 
 
@@ -155,31 +158,28 @@ class TiledDetector:
     """
 
     def __init__(self, detector: Detector, *, grid: Grid | Literal["auto"]) -> None:
-        self._detector = detector
+        self.whole = detector
         self._grid: Grid | Literal["auto"] = grid
         self._auto: dict[tuple[int, int], Grid] = {}
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        return self._detector.class_names
+        return self.whole.class_names
 
     def grid(self, source_size: tuple[int, int]) -> Grid:
         """(columns, rows) for a picture of this (width, height); (1, 1) is the whole picture alone."""
         if self._grid != "auto":
             return self._grid
         if source_size not in self._auto:
-            self._auto = {source_size: auto_grid(source_size, self._detector)}
+            self._auto = {source_size: auto_grid(source_size, self.whole)}
         return self._auto[source_size]
-
-    def detect_whole(self, image_bgr: Image) -> Detections:
-        return self._detector.detect(image_bgr)
 
     def detect(self, image_bgr: Image) -> Detections:
         """Detections in the pixels of this image, best first; at most `MAX_DETECTIONS`."""
         grid = self.grid((image_bgr.shape[1], image_bgr.shape[0]))
         tiles = tile_boxes((image_bgr.shape[1], image_bgr.shape[0]), grid)
-        whole = self._detector.detect(image_bgr)
-        return with_tiles(whole, image_bgr, tiles if grid != (1, 1) else (), self._detector.detect)
+        whole = self.whole.detect(image_bgr)
+        return with_tiles(whole, image_bgr, tiles if grid != (1, 1) else (), self.whole.detect)
 
 
 def with_tiles(

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from hvt_common.inference.detect import FailingDetector
+from hvt_common.inference.retried import without_tiles
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.runtime.statistics import SequenceWindow
@@ -55,8 +56,8 @@ class Analyzer:
     see `analyze` for streams that code fewer; up to ``detect_still_every`` while nothing changes.
 
     While the detector gives None the tracks are carried on. ``trust`` receives its detections. ``search`` finds the
-    scale; without it the scale is as given. A detection that is due waits until ``cpu_budget`` admits it; decoding
-    and tracking never do.
+    scale; without it the scale is as given. A detection that is due waits until ``cpu_budget`` admits it, and may get
+    a smaller input there, without tiles or search; decoding and tracking never wait.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Analyzer:
         search: ScaleSearch | None = None,
         cpu_budget: CpuBudget | None = None,
     ) -> None:
-        self._detector = detector
+        self._detector, self._detect_whole = detector, without_tiles(detector)
         self._tracker = tracker
         self._view = view
         self._every, self._still_every, self._candidates = detect_every, detect_still_every, candidates
@@ -196,6 +197,9 @@ class Analyzer:
         return rested and sparse and self._candidates == "source"
 
     def _found(self, image_bgr: Image) -> Detections | None:
+        share = self.cpu_budget.detector_share
+        if share < 1:
+            return self._detect_whole(image_bgr, share=share)
         whole = self._detector.detect(image_bgr)
         return whole if whole is None or self._search is None else self._search.take(whole, image_bgr)
 

@@ -29,6 +29,10 @@ _LONGEST_TRACK_S: Final = 0.5
 _MOST_TRACKING: Final = 0.5
 _MOST_DETECTING: Final = 0.85
 """Shares of the cores that the earlier parts have left."""
+_USUAL_DETECT_S: Final = 0.9
+"""A detection that would come more seldom gets an input with a share of its sides, in eighths …"""
+_STEPS, _LEAST_SIDES = 8, 0.5
+"""… and half of them at least: a vehicle of 12 pixels has 6 then."""
 _LEAST_CORES: Final = 0.5
 _SHARE: Final = 0.5
 """With fewer than 3 detections a second tracking from a moving camera fails: with 1.5 it holds a third (car10)."""
@@ -56,6 +60,8 @@ class Plan:
     track_s: float = 0.0
     detect_s: float = 0.0
     compare_s: float = 0.0
+    detector_share: float = 1.0
+    """Of the sides of the detector's input."""
 
 
 def most_cores(processors: float, *, others: float = 0.0) -> float:
@@ -70,6 +76,7 @@ def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
     |---|---|---|---|
     | 1 | track | each frame, for half of the cores at most | twice a second |
     | 2 | detect, with its stills | .85 of the remaining cores | each 5 s |
+    | | with a smaller input if it comes less often than each .9 s | | |
     | 3 | compare | the rest | never |
     """
     track, detect, compare, choose = (
@@ -77,9 +84,15 @@ def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
     )
     track_s = _every_s(track, _MOST_TRACKING * cores, longest_s=_LONGEST_TRACK_S)
     left = max(0.0, cores - track * min(fps, 1 / track_s if track_s else fps))
-    detect_s = _every_s(detect + choose, _MOST_DETECTING * left, longest_s=LONGEST_DETECT_S)
+    most_s = max(0.0, _USUAL_DETECT_S * _MOST_DETECTING * left - choose)
+    share = (
+        1.0
+        if detect <= most_s
+        else max(_LEAST_SIDES, math.floor(_STEPS * math.sqrt(most_s / detect)) / _STEPS)
+    )
+    detect_s = _every_s(detect * share**2 + choose, _MOST_DETECTING * left, longest_s=LONGEST_DETECT_S)
     compare_s = _every_s(compare, (1 - _MOST_DETECTING) * left, longest_s=math.inf)
-    return Plan(track_s if track_s * fps > 1 else 0.0, detect_s, compare_s)
+    return Plan(track_s if track_s * fps > 1 else 0.0, detect_s, compare_s, share)
 
 
 def _every_s(cost_s: float, cores: float, *, longest_s: float) -> float:
@@ -114,6 +127,8 @@ class CpuBudget:
         self._waits_ns: int | None = None
         """The first frame since the detector last ran, or was last not due."""
         self._newest_ns = 0
+        self.detector_share = 1.0
+        """Of the sides of the detector's input, for the detection that was admitted last."""
         self.queued = 0
         """Frames behind the one in hand."""
         self.keyframe_soon = False
@@ -151,7 +166,10 @@ class CpuBudget:
 
     def admits_detection(self, at_ns: int, *, due: bool = True) -> bool:
         """Whether the detector searches the source of that frame, if a detection is ``due``."""
-        admitted = due and self._has_time and self._take("detect", self.plan.detect_s, at_ns)
+        plan = self.plan
+        admitted = due and self._has_time and self._take("detect", plan.detect_s, at_ns)
+        if admitted:
+            self.detector_share = plan.detector_share
         if admitted or not due:
             self._waits_ns = None
         return admitted
@@ -181,8 +199,11 @@ class CpuBudget:
         yield
         took_ns = self._spent_ns() - began_ns
         self._perceived_ns += took_ns
-        before_s = self._costs.get(part, took_ns / SECOND_NS)
-        self._costs[part] = before_s + _NEWEST * (took_ns / SECOND_NS - before_s)
+        cost_s = took_ns / SECOND_NS
+        if part == "detect":  # of the full input, about
+            cost_s /= self.detector_share**2
+        before_s = self._costs.get(part, cost_s)
+        self._costs[part] = before_s + _NEWEST * (cost_s - before_s)
 
     def measure(self, cores: float, *, now_ns: int) -> None:
         """Add a measurement: the cores that this process took since the last one, about a second ago."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from functools import partial
 from typing import Literal, cast
 
 import numpy as np
@@ -24,10 +23,10 @@ from hvt_common.inference.labels import (
     is_calibrated,
     uncalibrated,
 )
-from hvt_common.inference.retried import RetriedDetector
+from hvt_common.inference.retried import without_tiles
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
-from hvt_common.inference.tiles import detect_whole, searches_scale, tiled
+from hvt_common.inference.tiles import searches_scale, tiled
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings, weak_confidence
@@ -132,7 +131,7 @@ def _scale_search(config: EdgeConfig, detector: FailingDetector) -> ScaleSearch 
         config.detector, role="detector"
     ):
         return None
-    return ScaleSearch(_whole(detector), confidence=track_confidence(config))
+    return ScaleSearch(without_tiles(detector), confidence=track_confidence(config))
 
 
 def make_shadow(
@@ -151,17 +150,11 @@ def make_shadow(
     if not config.measures or config.detector == MOTION:
         return None
     return ShadowGround(
-        _whole(detector),
+        without_tiles(detector),
         confidence=track_confidence(config),
         before=before,
         cpu_budget=cpu_budget,
     )
-
-
-def _whole(detector: FailingDetector) -> Callable[[Image], Detections | None]:
-    if isinstance(detector, RetriedDetector):
-        return detector.detect_whole
-    return partial(detect_whole, cast("Detector", detector))
 
 
 def track_confidence(config: EdgeConfig) -> float:

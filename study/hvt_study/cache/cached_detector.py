@@ -59,7 +59,8 @@ class CachedDetector(OnnxDetector):
         self.saved_cpu_s = 0.0
         """The cost of the answers out of memory, less that of remembering."""
 
-    def detect(self, image_bgr: Image) -> Detections:
+    def detect(self, image_bgr: Image, *, share: float = 1.0) -> Detections:
+        assert share == 1, "a study flies in lockstep, where nothing is reduced"
         began_s = time.process_time()
         path = self._folder / self._key(image_bgr)
         known = _read(path)

@@ -311,7 +311,7 @@ def test_a_folder_that_cannot_be_made_is_refused_at_the_start(tmp_path, monkeypa
     def homeless() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
-    config = check(EdgeConfig(source="demo", store_folder=tmp_path / "file", listen=("tcp/127.0.0.1:0",)))
+    config = check(EdgeConfig(source="demo", store_folder=tmp_path / "file", listen=("tcp/127.0.0.1:7447",)))
     with pytest.raises(UserError, match="--store-folder"):
         Edge(config, stop=threading.Event()).run()
     monkeypatch.setenv("XDG_STATE_HOME", "")

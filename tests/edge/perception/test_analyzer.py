@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from contextlib import closing
 from dataclasses import replace
+from itertools import count
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from hvt_edge.config import EdgeConfig, check
 from hvt_edge.operating import Keyframes
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from hvt_edge.wiring.perception import make_analyzer
@@ -96,6 +98,29 @@ def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, run
     for frame, unit in zip(FRAMES[:6], UNITS, strict=False):
         analyzer.analyze(frame, unit)
     assert network.runs == runs
+
+
+def test_a_slow_machine_searches_with_a_smaller_input_and_not_enlarged():
+    """Boxes of a board were up to four seconds old."""
+    shares: list[float] = []
+
+    class Sized(RedSquares):
+        def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
+            return image_size
+
+        def detect(self, image_bgr, *, share: float = 1.0):
+            shares.append(share)
+            return super().detect(image_bgr)
+
+    now_ns = count(0, 9 * SECOND_NS // 100)
+    budget = CpuBudget(fps=15, processors=0.5, spent_ns=lambda: next(now_ns))
+    search = ScaleSearch(NothingSeen().detect, confidence=0.25)
+    search.enlarged = True
+    analyzer = make(detector=Sized(), search=search, detect_every=1, cpu_budget=budget)
+    for frame, unit in zip(FRAMES, UNITS, strict=True):
+        analyzer.analyze(frame, unit)
+    assert shares[0] == 1, "nothing is measured yet"
+    assert shares[-1] == 0.5
 
 
 def test_what_nobody_uses_is_not_searched_and_goes_on_from_any_frame():

@@ -15,21 +15,21 @@ COSTS = {"track": 0.006, "detect": 0.14, "compare": 0.14, "choose": 0.01}
 
 
 @pytest.mark.parametrize(
-    ("cores", "track_s", "detect_s", "compare_s"),
+    ("cores", "track_s", "detect_s", "compare_s", "share"),
     [
-        (math.inf, 0, 0, 0),
-        (1.0, 0, 0.194, 1.03),
-        (0.25, 0, 1.10, 5.83),
-        (0.1, 0.12, 3.53, 18.7),
-        (0.02, 0.5, 5, 117),
-        (0.0, 0.5, 5, math.inf),
+        (math.inf, 0, 0, 0, 1),
+        (1.0, 0, 0.194, 1.03, 1),
+        (0.25, 0, 0.861, 5.83, 0.875),
+        (0.1, 0.12, 1.06, 18.7, 0.5),
+        (0.02, 0.5, 5, 117, 0.5),
+        (0.0, 0.5, 5, math.inf, 0.5),
     ],
 )
-def test_what_comes_later_gives_way_first(cores, track_s, detect_s, compare_s):
-    """A board would have no boxes at all because it measures what boxes are worth."""
+def test_what_comes_later_gives_way_first(cores, track_s, detect_s, compare_s, share):
+    """A board would have no boxes at all because it measures what boxes are worth, or boxes of four seconds ago."""
     plan = share_out(cores, COSTS, fps=FPS)
-    assert (plan.track_s, plan.detect_s, plan.compare_s) == pytest.approx(
-        (track_s, detect_s, compare_s), rel=0.01
+    assert (plan.track_s, plan.detect_s, plan.compare_s, plan.detector_share) == pytest.approx(
+        (track_s, detect_s, compare_s, share), rel=0.01
     )
 
 
@@ -81,7 +81,8 @@ class Rig:
 
     def _spend(self, part, noted: list[int]) -> None:
         with self.budget.spending(part):
-            self.spent_ns += round(COSTS[part] * SECOND_NS)
+            of_input = self.budget.detector_share**2 if part == "detect" else 1
+            self.spent_ns += round(COSTS[part] * of_input * SECOND_NS)
         noted.append(self.index)
 
 
@@ -106,7 +107,9 @@ def test_a_flight_keeps_to_its_budget_and_follows_each_frame():
 def test_what_video_takes_is_not_there_for_perception():
     """Frames would be lost on a board before anything gives way."""
     roomy, tight = (Rig(processors=0.5, video=video).fly(20) for video in (0.1, 0.4))
-    assert len(tight.looked) < len(roomy.looked) / 2
+    assert len(tight.looked) < len(roomy.looked)
+    assert tight.budget.detector_share == 0.5
+    assert roomy.budget.detector_share > 0.7, "fewer first, then smaller, then fewer still"
 
 
 def test_each_frame_that_video_loses_halves_the_budget_and_it_comes_back():
