@@ -104,6 +104,7 @@ def _commands(data: bytes) -> None:
             assert answer.pack()
     if rig.request_ns % (200 * 50 * _MS) == 0:
         rig.run(1)
+        rig.out.puts.clear()  # the link of a rig keeps all that is sent
 
 
 def _command_seeds() -> list[bytes]:
