@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from hvt_common.runtime import plug_ins
 from hvt_common.runtime.process import STOP_SIGNALS
@@ -34,10 +34,10 @@ STDERR = pytest.StashKey[int]()
 HANGS_S = 420
 ROOT = Path(__file__).resolve().parent.parent
 
-# Hypothesis' own 200 ms for an example are an assertion on speed: a machine that stops the process for so long would
+# Hypothesis' own 200 ms for an example, and its seconds to make them, are assertions on speed: a busy machine would
 # break a property that holds. Here and not in a fixture: `@settings` takes what is loaded when its module is read.
 # The same examples each time, so that a commit which passed once passes again; `make nightly` searches for others.
-settings.register_profile("search", deadline=None)
+settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("hvt", settings.get_profile("search"), derandomize=True)
 settings.load_profile("hvt")
 
