@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.detect import FailingDetector, detect_every, detect_still_every
-from hvt_common.inference.retried import without_tiles
+from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import searches_scale
@@ -183,7 +183,8 @@ class SessionPerception:
         facts = self._models.facts
         if not facts.calibrated or not searches_scale(self._config.tiles, pace=self._info.pace):
             return None
-        return ScaleSearch(without_tiles(detector), confidence=facts.track_confidence)
+        detect = detector.detect_whole if isinstance(detector, RetriedDetector) else detector.detect
+        return ScaleSearch(detect, confidence=facts.track_confidence)
 
     def _tracker(self) -> ByteTracker:
         motion = cast('Literal["off", "flow"]', self._config.camera_motion)
