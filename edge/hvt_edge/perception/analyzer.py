@@ -57,7 +57,8 @@ class Analyzer:
 
     While the detector gives None the tracks are carried on. ``trust`` receives its detections. ``search`` finds the
     scale; without it the scale is as given. A detection that is due waits until ``cpu_budget`` admits it, and may get
-    a smaller input there, without tiles or search; decoding and tracking never wait.
+    a smaller input there, without tiles or search, where it ``reduces`` and nothing is enlarged; decoding and
+    tracking never wait.
     """
 
     def __init__(
@@ -72,7 +73,9 @@ class Analyzer:
         trust: ViewTrust | None = None,
         search: ScaleSearch | None = None,
         cpu_budget: CpuBudget | None = None,
+        reduces: bool = True,
     ) -> None:
+        self._reduces = reduces
         self._detector, self._detect_whole = detector, without_tiles(detector)
         self._tracker = tracker
         self._view = view
@@ -154,6 +157,8 @@ class Analyzer:
         pixels: Image | None = frame.base_bgr
         if self._candidates == "decoded":
             pixels = None if picture is None else picture.gray()
+        # Objects of a few pixels, which are looked at enlarged, would come and go.
+        self.cpu_budget.reduces = self._reduces and not (self._search is not None and self._search.enlarged)
         due = self.cpu_budget.admits_detection(
             frame.capture_ns, due=self._due(frame.index, coded=unit is not None)
         )

@@ -69,7 +69,9 @@ def most_cores(processors: float, *, others: float = 0.0) -> float:
     return min(max(_LEAST_CORES, _SHARE * processors), max(0.0, (1 - _IDLE) * processors - others))
 
 
-def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
+def share_out(
+    cores: float, costs: Mapping[Part, float], *, fps: float, least_sides: float = _LEAST_SIDES
+) -> Plan:
     """The plan for ``cores``; ``costs`` are the core seconds of one turn of each part.
 
     | order | part | gets | at least |
@@ -88,7 +90,7 @@ def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
     share = (
         1.0
         if detect <= most_s
-        else max(_LEAST_SIDES, math.floor(_STEPS * math.sqrt(most_s / detect)) / _STEPS)
+        else max(least_sides, math.floor(_STEPS * math.sqrt(most_s / detect)) / _STEPS)
     )
     detect_s = _every_s(detect * share**2 + choose, _MOST_DETECTING * left, longest_s=LONGEST_DETECT_S)
     compare_s = _every_s(compare, (1 - _MOST_DETECTING) * left, longest_s=math.inf)
@@ -127,6 +129,8 @@ class CpuBudget:
         self._waits_ns: int | None = None
         """The first frame since the detector last ran, or was last not due."""
         self._newest_ns = 0
+        self.reduces = True
+        """Whether the detector's input may be reduced now."""
         self.detector_share = 1.0
         """Of the sides of the detector's input, for the detection that was admitted last."""
         self.queued = 0
@@ -139,7 +143,8 @@ class CpuBudget:
         if math.isinf(self._processors):
             return Plan()
         cores = most_cores(self._processors, others=self._others)
-        return share_out(cores * self._left, self._costs, fps=self._fps)
+        least_sides = _LEAST_SIDES if self.reduces else 1.0
+        return share_out(cores * self._left, self._costs, fps=self._fps, least_sides=least_sides)
 
     @property
     def too_slow(self) -> bool:

@@ -26,7 +26,7 @@ from hvt_common.inference.labels import (
 from hvt_common.inference.retried import without_tiles
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
-from hvt_common.inference.tiles import searches_scale, tiled
+from hvt_common.inference.tiles import parse_tiles, searches_scale, tiled
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings, weak_confidence
@@ -122,6 +122,7 @@ def make_analyzer(
         trust=trust,
         search=_scale_search(config, detector),
         cpu_budget=cpu_budget,
+        reduces=parse_tiles(config.tiles) in {"auto", "off"},  # tiles of one's own are meant
     )
 
 

@@ -100,8 +100,13 @@ def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, run
     assert network.runs == runs
 
 
-def test_a_slow_machine_searches_with_a_smaller_input_and_not_enlarged():
-    """Boxes of a board were up to four seconds old."""
+@pytest.mark.parametrize(
+    ("enlarged", "reduces", "share"), [(False, True, 0.5), (True, True, 1), (False, False, 1)]
+)
+def test_a_slow_machine_searches_a_smaller_input_but_for_small_objects_and_tiles_of_ones_own(
+    enlarged, reduces, share
+):
+    """Boxes of a board were up to six seconds old; those of a few pixels would come and go."""
     shares: list[float] = []
 
     class Sized(RedSquares):
@@ -115,12 +120,12 @@ def test_a_slow_machine_searches_with_a_smaller_input_and_not_enlarged():
     now_ns = count(0, 9 * SECOND_NS // 100)
     budget = CpuBudget(fps=15, processors=0.5, spent_ns=lambda: next(now_ns))
     search = ScaleSearch(NothingSeen().detect, confidence=0.25)
-    search.enlarged = True
-    analyzer = make(detector=Sized(), search=search, detect_every=1, cpu_budget=budget)
+    search.enlarged = enlarged
+    analyzer = make(detector=Sized(), search=search, detect_every=1, cpu_budget=budget, reduces=reduces)
     for frame, unit in zip(FRAMES, UNITS, strict=True):
         analyzer.analyze(frame, unit)
     assert shares[0] == 1, "nothing is measured yet"
-    assert shares[-1] == 0.5
+    assert shares[-1] == share
 
 
 def test_what_nobody_uses_is_not_searched_and_goes_on_from_any_frame():
