@@ -191,18 +191,23 @@ def check_apart(files: Iterable[tuple[str, Path | None]]) -> None:
 
 
 def exit_with_sentence(
-    run: Callable[[Sequence[str] | None], int], *, program: str, argv: Sequence[str] | None
+    run: Callable[[Sequence[str] | None], int],
+    *,
+    program: str,
+    argv: Sequence[str] | None,
+    local: re.Pattern[str] | None = None,
 ) -> int:
     """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError` or a `NotYetError`, said.
 
     130, as of a shell, where the user has interrupted it. Neither that nor a traceback has the secrets of an address
-    in ``argv``.
+    in ``argv``; a word that ``local`` matches whole is none.
 
     Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word; a full disk,
     or no memory, with 1. Standard streams that were closed are /dev/null.
     """
     _open_standard_streams()
-    redaction = Redaction(sys.argv[1:] if argv is None else argv)
+    words = sys.argv[1:] if argv is None else argv
+    redaction = Redaction(one for one in words if local is None or not local.fullmatch(one))
     sys.excepthook = _traceback_without(redaction)
     try:
         _check_folder()

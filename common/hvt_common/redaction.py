@@ -17,8 +17,11 @@ HIDDEN = "…"
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}):[/\\]+", re.ASCII)
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]*(?:%\w{1,16})?\]|[\w*-]+(?:\.[\w*-]+)*)(?::(\d{1,5}))?", re.ASCII)
-_FILE = re.compile(r"[^@?&=#:\\]*|[^@?&=#\\]*\d:\d[^@?&=#\\]*")
-"""Text that may be the name of a file: a colon stands between the digits of a time alone."""
+_FILE = re.compile(
+    r"[^@?&=#:\\]*|[^@?&=#\\]*\d:\d[^@?&=#\\]*|[^/:\\]*\.[A-Za-z]\w{1,3}|[^@?:\\]*\.[A-Za-z]\w{1,3}", re.ASCII
+)
+"""Text that may be the name of a file: a colon stands between the digits of a time alone, and the signs of an address
+in a name with an ending alone."""
 _SCHEMELESS = re.compile(
     r"\s*(?:(?:rtsps?|rtmps?|https?|srt|udp|tcp|rtp)\b[:/\\]|\w*//|[^/]*:\d+/|(?:\d{1,3}\.){3}\d)|.*:[/\\]",
     re.IGNORECASE | re.DOTALL,

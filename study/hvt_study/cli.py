@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -30,6 +31,8 @@ COMMANDS: Final = {
 
 RENAMED: Final = {"sight": "compare"}  # the former name works for one release
 _PROGRAM = "hvt-study"
+_DATASET = re.compile(r"[a-z]+:(?!//)[^@]*", re.DOTALL)
+"""``still:pictures?labelled=car``: a folder and options, no address."""
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -43,7 +46,7 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``hvt-study``; 0, or 2 after one sentence on stderr where the user can mend something."""
     interrupt_on_signals()
-    return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
+    return exit_with_sentence(_run, program=_PROGRAM, argv=argv, local=_DATASET)
 
 
 def _run(argv: Sequence[str] | None) -> int:

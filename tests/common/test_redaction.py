@@ -181,6 +181,14 @@ def test_other_words_stay_as_they_are():
     assert Redaction(["--source", "clip@2x.mp4", "--budget", "800kbps"]).text(line) == line
 
 
+@pytest.mark.parametrize(
+    "name", ["clip #2.mp4", "a&b.mp4", "x=1.mp4", "who?.mkv", "me@home.mp4", "day 1/a & b #2.png"]
+)
+def test_the_name_of_a_file_may_hold_what_addresses_do(name):
+    """A file that is not there was called "…", so that nobody saw the letter that was wrong in its name."""
+    assert redacted(name) == Redaction([f"--source={name}", name]).text(name) == name
+
+
 @pytest.mark.parametrize("form", ["text", "json"])
 def test_neither_log_nor_traceback_nor_sentence_has_it(capsys, form):
     """The one line that nobody has thought of would give the camera away."""

@@ -174,3 +174,9 @@ def test_short_and_long_are_told_in_a_unit_that_says_something():
         "0.1667 (10 minutes)",
         "3.0",
     ]
+
+
+def test_a_dataset_that_is_not_there_is_named_with_its_options(capsys):
+    """Its question mark made it an address, and the sentence said that '…?…' does not exist."""
+    assert main(["plan", uri := "still:kit?classes=car,truck&labelled=car"]) == 2
+    assert f"dataset {uri!r}: folder 'kit' does not exist" in capsys.readouterr().err
