@@ -12,7 +12,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer, of_fil
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_common.errors import UserError, telling
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
-from hvt_common.video.hevc import is_keyframe
+from hvt_common.video.hevc import BaseDecoder, is_keyframe
 from hvt_ground.events import VEHICLE, Notice, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import NOWHERE, Locator
 from hvt_ground.recordings.row import Recorded, RecordedStill
@@ -226,14 +225,12 @@ class _File:
         samples = self.rows.get((VIDEO, _SAMPLE))
         if not isinstance(samples, SpooledRows):
             return 0
-        steps = [0, *(after - before for before, after in pairwise(samples.frames))]
-        stays, waits = list[bool](), False
-        for place, step in enumerate(steps):
-            # Longer than those around it; where the rate changes, those after it are as long.
-            near = steps[max(place - 1, 1) : place] + steps[place + 1 : place + 6]
-            waits |= bool(near) and step > steps[place - 1] and step > min(near)
-            waits = waits and not is_keyframe(samples.value(place))
-            stays.append(not waits)
+        decoder, stays = BaseDecoder(), list[bool]()
+        for place in range(len(samples)):
+            unit = samples.value(place)
+            if is_keyframe(unit):
+                decoder.reset()
+            stays.append(decoder.decode_yuv(unit) is not None)
         samples.keep(stays.__getitem__)
         return stays.count(False)
 
