@@ -89,8 +89,10 @@ class RrdFile:
 
     def compact(self, chunks: Sequence[Chunk]) -> None:
         """Replace the append log by ``chunks``, which say the same in fewer bytes, and begin a new one."""
-        self._write(self._encoded(chunks), at=self._compacted_bytes)
-        self._compacted_bytes = self.size_bytes
+        try:
+            self._write(self._encoded(chunks), at=self._compacted_bytes)
+        finally:  # where it failed the log stays: nothing else has its rows
+            self._compacted_bytes = self.size_bytes
 
     def show(self, screen: rrb.Blueprint) -> None:
         """Open with another screen from now on; right after `compact`, which would write over it."""
@@ -154,13 +156,13 @@ class RrdFile:
                 written = os.pwrite(self._file, data, end)
                 end += written
                 data = data[written:]
-            if end < self.size_bytes:
+            if end < os.fstat(self._file).st_size:
                 os.ftruncate(self._file, end)
         except OSError as error:
-            if end > at:  # half a message
+            if data and end > at:  # half a message; the next write begins there, should it not go
+                self.size_bytes = at
                 with suppress(OSError):
                     os.ftruncate(self._file, at)
-                    self.size_bytes = at
             raise UserError(
                 f"recording {self.path} cannot be written any further: {error.strerror}"
             ) from error
