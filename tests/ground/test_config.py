@@ -84,8 +84,9 @@ def test_a_folder_that_is_not_there_is_made_and_a_file_of_another_kind_refused(t
     make_folders(config)
     assert folder.is_dir()
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(UserError, match=f"--{option} .*notes.txt is neither a folder nor named {file[1:]}"):
-        check_outputs(read(f"--{option}", str(tmp_path / "notes.txt")))
+    for name in ("notes.txt", "absent.MP4"):
+        with pytest.raises(UserError, match=f"--{option} .*{name} is neither a folder nor named {file[1:]}"):
+            check_outputs(read(f"--{option}", str(tmp_path / name)))
     with pytest.raises(UserError, match=f"--{option} .* cannot be made"):
         make_folders(read(f"--{option}", str(tmp_path / "notes.txt" / "in")))
 

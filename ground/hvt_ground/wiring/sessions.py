@@ -39,6 +39,9 @@ from hvt_ground.sinks.rerun.rrd_file import locked
 
 _log = logging.getLogger(__name__)
 
+_OF_FILES = frozenset({".avi", ".csv", ".hvtlog", ".json", ".mcap", ".mkv", ".mov", ".mp4", ".rrd", ".ts", ".txt"})
+"""Endings of names that mean a file, also where no such folder is there yet."""
+
 
 def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = (), records: bool = True) -> None:
     """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`.
@@ -58,7 +61,7 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = (), records: 
     for name, path, suffix in (*written(config), *here):
         if is_file(path, suffix):
             check_writable(path, name=name, reads=reads)
-        elif path.exists() and not path.is_dir():
+        elif not path.is_dir() and (path.exists() or path.suffix.lower() in _OF_FILES):
             raise UserError(
                 f"{name} {path} is neither a folder nor named {suffix}: give FILE{suffix} or a folder"
             )
@@ -157,7 +160,7 @@ def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]
 
     Never over another file: its edge has forgotten the contents.
     """
-    if target is not None and target.suffix == ".rrd" and not target.is_dir():
+    if target is not None and is_file(target, ".rrd"):
         return free_path([target.with_name(f"{target.stem}-{edge}-backlog.rrd")], taken, number=2)
     return free_path([(target or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"], taken, number=2)
 
