@@ -57,7 +57,7 @@ class Site:
         token = request.query_params.get("token")
         if token is None:
             return _file("index.html")
-        response = RedirectResponse("/", 303)
+        response = RedirectResponse(".", 303)  # a proxy may show it below a path
         secure = request.url.scheme == "https"
         response.set_cookie(
             cookie_name(request.headers), token, _COOKIE_S, httponly=True, samesite="lax", secure=secure

@@ -90,7 +90,7 @@ export class Wall {
     const known = total !== null && budget !== null;
     card.bar.hidden = !known;
     card.bar.value = known ? Math.min(1, total / budget) : 0;
-    card.bar.title = known ? words.shareWords(total, budget) : "";
+    card.bar.title = card.bar.ariaValueText = known ? words.shareWords(total, budget) : "";
   }
 
   /**

@@ -247,7 +247,7 @@ def test_elsewhere_nothing_is_shown_without_the_token(public, state_folder):
         joined(public)
     assert refused.value.response.status_code == 401
     status, headers, _ = asked(public, f"/?token={tokens['viewer']}")
-    assert (status, headers["location"]) == (303, "/")
+    assert (status, headers["location"]) == (303, "."), "the page of a proxy lies below a path"
     assert "HttpOnly" in headers["set-cookie"]
     cookie = f"hvt-{public}={tokens['viewer']}"
     assert asked(public, "/", Cookie=cookie)[0] == 200

@@ -212,12 +212,14 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
         const {{ light, state: words }} = wall.card("uav-1");
         return [light.dataset.state, words.textContent];
       }});
+      wall.state("uav-1", {{ ...state("up"), total: 2e5, budget: 5e5 }}, 112000);
       wall.refresh(112000, new Set(["uav-2"])); // a ground that was restarted tells of that one alone
-      console.log(JSON.stringify([...seen, [wall.card("uav-1").light.dataset.state]]));
+      const {{ light, bar }} = wall.card("uav-1");
+      console.log(JSON.stringify([...seen, [light.dataset.state, bar.ariaValueText]]));
     """
     )
     silent = ["silent", "no picture 12 s"]
-    assert found == [["up", "up 3 s"], silent, silent, ["lost", "lost 12 s"], ["unknown"]]
+    assert found == [["up", "up 3 s"], silent, silent, ["lost", "lost 12 s"], ["unknown", "200 kbps of 500 kbps"]]
 
 
 @needs_node
