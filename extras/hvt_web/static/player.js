@@ -120,15 +120,11 @@ export class Player {
   /** @param {{frame: number, captured: number}} head @param {Uint8Array} data */
   jpeg(head, data) {
     if (!this.live) return;
-    const url = URL.createObjectURL(new Blob([data], { type: "image/jpeg" }));
-    const old = this.image.src;
-    this.image.onload = () => {
-      if (old.startsWith("blob:")) URL.revokeObjectURL(old);
-      this.onShown({ media: 0, frame: head.frame, captured: head.captured });
-    };
+    this.image.onload = () => this.onShown({ media: 0, frame: head.frame, captured: head.captured });
     this.video.hidden = true;
     this.image.hidden = false;
-    this.image.src = url;
+    URL.revokeObjectURL(this.image.src);
+    this.image.src = URL.createObjectURL(new Blob([data], { type: "image/jpeg" }));
   }
 
   /** Stop where it is. */

@@ -56,10 +56,7 @@ export class Wall {
     const card = this.card(edge);
     const { picture } = card;
     card.captured = captured;
-    const old = picture.src;
-    picture.onload = () => {
-      if (old) URL.revokeObjectURL(old);
-    };
+    URL.revokeObjectURL(picture.src); // at once: one that was never loaded would stay in memory
     picture.src = URL.createObjectURL(new Blob([data], { type: "image/jpeg" }));
   }
 

@@ -39,7 +39,9 @@ from hvt_ground.sinks.rerun.rrd_file import locked
 
 _log = logging.getLogger(__name__)
 
-_OF_FILES = frozenset({".avi", ".csv", ".hvtlog", ".json", ".mcap", ".mkv", ".mov", ".mp4", ".rrd", ".ts", ".txt"})
+_OF_FILES = frozenset(
+    {".avi", ".csv", ".hvtlog", ".json", ".mcap", ".mkv", ".mov", ".mp4", ".rrd", ".ts", ".txt"}
+)
 """Endings of names that mean a file, also where no such folder is there yet."""
 
 

@@ -58,3 +58,18 @@ def test_a_pause_that_fills_the_browsers_memory_keeps_the_picture():
 def test_who_pauses_single_pictures_plays_on_with_the_newest():
     """The button said Play, and the picture stood still for good."""
     assert played("player.pause(); player.play(); console.log(JSON.stringify(player.live));") is True
+
+
+def test_pictures_that_come_faster_than_they_are_shown_leave_no_memory():
+    """A page of single pictures on a slow machine took more and more memory, overnight gigabytes."""
+    left = played("""
+      let urls = 0;
+      const held = new Set();
+      URL.createObjectURL = () => (held.add(`blob:${++urls}`), `blob:${urls}`);
+      URL.revokeObjectURL = (url) => held.delete(url);
+      player.image.src = "";
+      player.live = true;
+      for (let frame = 0; frame < 9; frame++) player.jpeg({ frame, captured: frame }, none);
+      console.log(JSON.stringify([...held]));
+    """)
+    assert left == ["blob:9"]

@@ -219,7 +219,13 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
     """
     )
     silent = ["silent", "no picture 12 s"]
-    assert found == [["up", "up 3 s"], silent, silent, ["lost", "lost 12 s"], ["unknown", "200 kbps of 500 kbps"]]
+    assert found == [
+        ["up", "up 3 s"],
+        silent,
+        silent,
+        ["lost", "lost 12 s"],
+        ["unknown", "200 kbps of 500 kbps"],
+    ]
 
 
 @needs_node

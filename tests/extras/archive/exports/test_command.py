@@ -324,7 +324,7 @@ def test_of_a_damaged_recording_the_rest_is_exported(recording, tmp_path, caplog
 
 
 def test_pictures_that_need_a_lost_one_are_not_exported(tmp_path, caplog):
-    """They counted as exported, and players showed smears; or, where the edge left frames out, others went as well."""
+    """They counted as exported, and players showed smears; where the edge left frames out, others went as well."""
     path, live = tmp_path / "flight.rrd", tmp_path / "live.rrd"
     drawn = drawn_frames(FRAMES, SIZE)
     with Recorder(settings(path)) as recorder:
