@@ -31,9 +31,12 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NO_MORE = (errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _NO_MORE_WORDS = ("can't start new thread", "failed to map segment from shared object")
 """Of Python's errors without a number."""
-FOREIGN = (Exception, SystemExit)
-"""Exceptions of foreign code: much of it calls `sys.exit` after a fault."""
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
+
+
+def foreign() -> type[BaseException]:
+    """What foreign code may raise, for an ``except``: much of it calls `sys.exit`, or panics in Rust. Not Ctrl-C."""
+    return Exception if isinstance(sys.exc_info()[1], KeyboardInterrupt | GeneratorExit) else BaseException
 
 
 class UserError(Exception):

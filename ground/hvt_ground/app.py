@@ -25,7 +25,7 @@ from hvt_ground.backlog.edge_backlog import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
-from hvt_ground.extras import Service, extras_of
+from hvt_ground.extras import Service, extras_of, part_of
 from hvt_ground.link.group import GroundGroup
 from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
@@ -138,7 +138,9 @@ class Ground:
             if config.group is not None:
                 shown = next((one.shown_to_others for one in services if one.shown_to_others), "")
                 group = stack.enter_context(GroundGroup(session, config.group, page=shown))
-            log = next((one.message_log for one in services if one.message_log is not None), None)
+            attempt = models.failures.attempt
+            logs = ((part_of(one), one.message_log) for one in services if one.message_log is not None)
+            log = next((partial(attempt, part, log, None) for part, log in logs), None)
             link = stack.enter_context(
                 GroundLink(
                     session,
@@ -224,7 +226,7 @@ class Ground:
                 give_back_holes()
                 self._state = maker.make(sorted(self._edges.items()))
                 for one in services:
-                    one.show(self._state)
+                    models.failures.attempt(part_of(one), one.show, None, self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
             if config.once and self._all_ended(loading=models.loading):
                 return

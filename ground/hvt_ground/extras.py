@@ -81,8 +81,16 @@ class Opening:
 OpenSinks = Callable[[Flight], Iterable[Opening]]
 
 
+def part_of(extra: object) -> str:
+    """The name of an extra, or of its service, among the parts that fail."""
+    return f"extra {type(extra).__module__.partition('.')[0]}"
+
+
 class Service:
-    """An extra's context around a whole run of a ground: it begins before the link opens and ends after it closes."""
+    """An extra's context around a whole run of a ground: it begins before the link opens and ends after it closes.
+
+    After `begin` the exceptions of its methods are failures of its own.
+    """
 
     links: Sequence[str] = ()
     """Where somebody can watch."""

@@ -136,6 +136,28 @@ def test_it_records_where_it_is_started_and_says_so_unless_a_program_takes_all(
     assert states[0].recorded == (program is None)
 
 
+def test_an_extra_that_raises_takes_nothing_with_it(
+    free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page that could not show a state ended the ground, without a summary; an index the recording."""
+    brings, states = Brings(), list[Any]()
+
+    def show(state: Any) -> None:
+        states.append(state)
+        raise RuntimeError("no room")
+
+    monkeypatch.setattr(brings.service, "show", show)
+    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
+    run = Run(config(free_port, tmp_path))
+    eventually(lambda: states and states[-1].failed, what="it is said")
+    run.stop.set()
+    eventually(lambda: run.over, what="the ground has ended")
+    assert [(one.part, one.reason) for one in states[-1].failed] == [
+        ("extra hvt_ground", "RuntimeError: no room")
+    ]
+    assert run.sessions == []
+
+
 def test_a_group_learns_of_the_page_whatever_else_is_served(
     free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,7 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NoReturn
 
 import pytest
 
@@ -17,6 +18,7 @@ from hvt_ground import app
 from hvt_ground.app import Ground
 from hvt_ground.backlog.session_backlog import read_still
 from hvt_ground.config import GroundConfig, check
+from hvt_ground.extras import Service
 from hvt_ground.perception import models as ground_models
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.stills.decode import ReceivedStill
@@ -161,3 +163,31 @@ def test_a_detector_that_is_none_after_all_ends_the_run_with_its_sentence(compil
     config = check(GroundConfig(listen=(f"tcp/127.0.0.1:{free_port}",), classifier="none", quiet=True))
     with pytest.raises(UserError, match=r"d\.onnx is not a detector"):
         Ground(config, stop=threading.Event(), on_started=compiler.done.set).run()
+
+
+class Broken(Service):
+    """An extra's service, of which each call raises."""
+
+    def sinks(self, *_: object) -> NoReturn:
+        raise RuntimeError("broken")
+
+    recorded = still_address = sinks
+
+
+def test_an_extra_that_raises_takes_no_session_and_no_recording_with_it(tmp_path: Path) -> None:
+    """No picture of any edge was recorded, for a session with it could not be opened."""
+    config = check(GroundConfig(detector="motion", classifier="none", record=tmp_path / "a.rrd"))
+    outputs, models = Outputs(Failures(time.time_ns)), Models(config)
+    factory = SessionFactory(
+        config, models, clock=time.time_ns, outputs=outputs, view=None, services=[Broken()]
+    )
+    flight, port = Flight(2), Port()
+    port.flight = flight
+    sessions = EdgeSessions(port, open_session=factory.open_session)
+    for index in range(2):
+        sessions.handle(flight.base(index))
+    sessions.close()
+    outputs.close()
+    assert len(Recording(tmp_path / "a.rrd").video()) == 2
+    assert [one.reason for one in models.failures.parts] == ["RuntimeError: broken"]
+    assert outputs.idle

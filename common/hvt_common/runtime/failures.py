@@ -7,10 +7,10 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 from weakref import WeakSet
 
-from hvt_common.errors import FOREIGN, NotYetError, UserError
+from hvt_common.errors import NotYetError, UserError, foreign
 from hvt_common.redaction import Redaction
 from hvt_common.units import SECOND_NS
 
@@ -18,6 +18,7 @@ _log = logging.getLogger(__name__)
 
 _Part = TypeVar("_Part")
 _Answer = TypeVar("_Answer")
+_Other = TypeVar("_Other")
 _REDACTION = Redaction()
 _STEADY_NS = 60 * SECOND_NS
 """A failure of a part that worked for a minute is reported anew."""
@@ -31,6 +32,10 @@ def reason_of(error: BaseException) -> str:
     """An error in one line: a sentence or a database's message as it is; anything else after its kind."""
     said = isinstance(error, UserError) or type(error).__module__ == "sqlite3"
     text = str(error) if said else f"{type(error).__name__}: {error}"
+    return _one_line(text)
+
+
+def _one_line(text: str) -> str:
     return " ".join(text.split())[:300]
 
 
@@ -101,7 +106,7 @@ class Failures:
         The ground, who watches the process and the summary are told the reason, without secrets of an address.
         ``last``: it ends, and is not tried again.
         """
-        reason = _REDACTION.text(reason)
+        reason = _one_line(_REDACTION.text(reason))
         now_ns = self._clock()
         with self._lock:
             before = self._parts.get(part)
@@ -122,6 +127,18 @@ class Failures:
             one = self._parts.get(part)
             if one is not None and one.count == count and not one.working:
                 self._parts[part] = replace(one, over=True)
+
+    def attempt(
+        self, part: str, call: Callable[..., _Answer], otherwise: _Other, *arguments: Any
+    ) -> _Answer | _Other:
+        """What a part answers that may raise any exception; ``otherwise`` where it does."""
+        try:
+            answer = call(*arguments)
+        except foreign() as error:
+            self.failed(part, reason_of(error))
+            return otherwise
+        self.works(part)
+        return answer
 
     def works(self, part: str) -> None:
         with self._lock:
@@ -248,7 +265,7 @@ class Retried(Generic[_Part]):
                     self.part = self._open_part()
                 with self._turns:
                     answer = use(self.part)
-            except FOREIGN as error:
+            except foreign() as error:
                 self._pause.failed(self._clock(), again=self._failed)
                 self._failed = True
                 self._failures.failed(self._name, reason_of(error))

@@ -8,7 +8,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
 
-from hvt_common.errors import FOREIGN, UserError, needs_extra
+from hvt_common.errors import UserError, foreign, needs_extra
 from hvt_common.runtime.failures import Failures
 
 
@@ -45,7 +45,7 @@ def loaded(entry: EntryPoint, make: Callable[[Any], Any], *, what: str) -> Any:
     """The result of ``make`` for the entry's object; `UserError` for whatever foreign code raises."""
     try:
         return make(entry.load())
-    except FOREIGN as error:
+    except foreign() as error:
         raise UserError(
             f"{what} {entry.name!r} of {origin(entry)} does not load: {type(error).__name__}: {error}"
         ) from error

@@ -280,10 +280,8 @@ def _close(session: zenoh.Session) -> None:
         return
 
     def close() -> None:
-        try:
+        with suppress(zenoh.ZError):
             session.close()  # type: ignore[no-untyped-call]
-        except zenoh.ZError as error:
-            _log.debug("closing the session: %s", error)
 
     closer = threading.Thread(target=close, name="zenoh-close", daemon=True)
     closer.start()

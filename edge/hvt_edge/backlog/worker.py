@@ -354,16 +354,15 @@ class StoreWorker:
         # Returns whether it succeeded; after a failure nothing is stored until a trial succeeds.
         try:
             do()
-        except OSError as error:
-            self._fail(f"--store-folder {error.filename or ''}: {error.strerror or error}")
         except Exception as error:  # noqa: BLE001 - a failure stops storing, never the flight
-            _log.debug("storing failed", exc_info=error)
-            self._fail(f"storing stopped ({reason_of(error)})")
-        else:
-            return True
-        return False
+            self._fail(error)
+            return False
+        return True
 
-    def _fail(self, reason: str) -> None:
+    def _fail(self, error: Exception) -> None:
+        reason = f"storing stopped ({reason_of(error)})"
+        if isinstance(error, OSError):
+            reason = f"--store-folder {error.filename or ''}: {error.strerror or error}"
         self.failed = True
         self._retry.failed(self._clock())
         self._failures.failed(_PART, reason)
@@ -373,9 +372,8 @@ class StoreWorker:
         try:
             do()
         except OSError as error:
-            self._fail(f"--store-folder {error.filename or ''}: {error.strerror or error}")
+            self._fail(error)
         except Exception as error:  # noqa: BLE001 - a failure stops sending, never storing nor the flight
-            _log.debug("sending what was stored failed", exc_info=error)
             self._backfill.put_aside()
             self._sending_retry.failed(self._clock())
             self._failures.failed(_SENDING_PART, f"what was stored is not sent ({reason_of(error)})")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import KW_ONLY, dataclass
 from typing import Protocol, Self
 
@@ -128,15 +128,13 @@ class ZenohLink:
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
         """Send one message; blocks while the link is full. A link that is gone drops it without an error."""
-        try:
+        with suppress(zenoh.ZError):
             # A report goes about once a second, and a ground that gets none subscribes again.
             if channel is Channel.STATUS and self._listener is not None and self._loses():
                 self._listener.declare_again(there=self.has_ground())
                 if not self.has_subscriber(Channel.BASE):
                     return
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
-        except zenoh.ZError as error:
-            _log.debug("%s was not sent: %s", channel, error)
 
     def listen(self, answers: Answers) -> None:
         self._listener = EdgeListener(
@@ -236,13 +234,7 @@ class EdgeListener:
 
     def _answered(self, channel: Channel, answer: Callable[[], bytes]) -> bytes | None:
         # None where that fails: no one would handle an error in Zenoh's thread.
-        try:
-            data = self.answers.reply(channel, answer())
-        except Exception as error:  # noqa: BLE001 - see above
-            self.failures.failed(channel, f"a ground got no answer ({type(error).__name__}: {error})")
-            return None
-        self.failures.works(channel)
-        return data
+        return self.failures.attempt(channel, lambda: self.answers.reply(channel, answer()), None)
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
         self._used.add(Channel.FEEDBACK)

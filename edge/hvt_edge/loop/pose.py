@@ -8,11 +8,11 @@ from copy import copy
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Final, Protocol, cast
 
-from hvt_common.errors import FOREIGN, UserError
+from hvt_common.errors import UserError
 from hvt_common.geodesy import between
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.messages import PoseEncoder
-from hvt_common.runtime.failures import Failures, reason_of
+from hvt_common.protocol.messages import PoseEncoder, PoseReport
+from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
@@ -125,16 +125,17 @@ class PoseStage:
             return
         self._due_ns = capture_ns + round(_EARLY * SECOND_NS)
         encoder = copy(self._encoder)  # the next report builds on the last one that was sent
-        try:
+
+        def encoded() -> Callable[[int], PoseReport] | None:
             pose = self.source.at(media_ns, capture_ns=capture_ns)
-            make = None if pose is None else encoder.encode(pose)
-        except FOREIGN as error:  # no value from an autopilot may end a flight
-            self.failures.failed(_PART, reason_of(error))
-            return
+            if pose is None and self.source.trouble:
+                raise UserError(self.source.trouble)
+            return None if pose is None else encoder.encode(pose)
+
+        # No value from an autopilot may end a flight.
+        make = self.failures.attempt(_PART, encoded, None)
         if make is None:
-            self.failures.failed(_PART, self.source.trouble)
             return
-        self.failures.works(_PART)
         if not self.sender.metadata(Channel.POSE, lambda at_ns: make(at_ns).pack(), now_ns=now_ns):
             self._due_ns = None  # the next frame tries again
             return

@@ -275,17 +275,12 @@ class LinkControl:
         """A ground reports (any thread). Where that fails the rate falls to its floor until a report counts again."""
         if feedback.session_id != self.transmitter.session_id:
             return
-        try:
-            self._apply(feedback, now_ns=self.clock())
-        except Exception as error:  # noqa: BLE001 - in a thread of the link, where it would go unnoticed
-            self.failures.failed(_PART, f"a report failed ({type(error).__name__}: {error})")
-            if self.pacer is not None:
-                self.pacer.on_fault(self.clock())
-        else:
-            self.failures.works(_PART)
+        if not self.failures.attempt(_PART, self._apply, False, feedback) and self.pacer is not None:
+            self.pacer.on_fault(self.clock())
 
-    def _apply(self, feedback: Feedback, *, now_ns: int) -> None:
+    def _apply(self, feedback: Feedback) -> bool:
         # The decision whether the report counts is made here, once.
+        now_ns = self.clock()
         sent = (self.transmitter.base_sequence, self.transmitter.still_sequence)
         report = self._primary.judge(feedback, sent=sent, now_ns=now_ns)
         self.keyframes.report_losses(feedback.receiver_id, feedback.lost_so_far + feedback.corrupt)
@@ -306,6 +301,7 @@ class LinkControl:
         self.inbox.on_report(report)
         if report.primary:
             self.transmitter.resend(feedback.missing_base, now_ns=now_ns)
+        return True
 
 
 def wait_for_ground(

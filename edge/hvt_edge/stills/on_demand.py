@@ -14,7 +14,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
-from hvt_common.errors import FOREIGN
+from hvt_common.errors import foreign
 from hvt_common.protocol.messages import MAX_TRACKS_NOW, TrackNow
 from hvt_common.runtime.failures import reason_of
 from hvt_common.runtime.statistics import Newest
@@ -341,7 +341,7 @@ class OnDemand:
         )
         try:
             pending.ready, note = code_requested(job, codec=codec, capacity=capacity)
-        except FOREIGN as error:  # a requester waits for an answer
+        except foreign() as error:  # a requester waits for an answer
             failed = RefusedError(f"it could not be coded ({reason_of(error)})")
             refused = error if isinstance(error, RefusedError) else failed
             self._give_up(pending, str(refused), now_ns=now_ns)

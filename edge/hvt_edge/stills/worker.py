@@ -6,22 +6,19 @@ Detection delays neither the base stream nor a requested still.
 from __future__ import annotations
 
 import contextlib
-import logging
 import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 
-from hvt_common.errors import FOREIGN
+from hvt_common.errors import foreign
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures, RetryPause, Turns
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.perception.shadow import Detected
 from hvt_edge.stills.stage import StillStage
-
-_log = logging.getLogger(__name__)
 
 _PART, _REQUESTED_PART = "stills", "requested stills"
 _LEAST_FRAMES = 2
@@ -151,7 +148,7 @@ class StillWorker:
                     analyzed = self.stage.analyze(*item)
                     self.stage.step(analyzed, now_ns=self.clock())
                 self.failures.works(_PART)
-            except FOREIGN as error:  # it ends stills for a while, never the flight
+            except foreign() as error:  # it ends stills for a while, never the flight
                 self._fail(error)
 
     def _run_requested(self) -> None:
@@ -162,13 +159,11 @@ class StillWorker:
                     with turns:
                         self.stage.send_requested(now_ns=self.clock())
                     self.failures.works(_REQUESTED_PART)
-            except FOREIGN as error:  # it ends one requested still, never the flight
-                _log.debug("a requested still failed", exc_info=error)
+            except foreign() as error:  # it ends one requested still, never the flight
                 self.failures.failed(_REQUESTED_PART, f"one was not sent ({type(error).__name__}: {error})")
                 self._given_up.wait(_FAILED_S)
 
     def _fail(self, error: BaseException) -> None:
-        _log.debug("stills failed", exc_info=error)
         with self._lock:
             self._pause.failed(self.clock())
             self._skipped.lose()

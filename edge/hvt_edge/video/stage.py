@@ -11,7 +11,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from hvt_common.errors import FOREIGN, FlightError
+from hvt_common.errors import FlightError, foreign
 from hvt_common.protocol.edge_words import FrameGroup
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS, bitrate_text
@@ -228,7 +228,7 @@ class BaseStage:
             unit = self.encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
             if decision.to_link:
                 unit = self._within_a_window(unit, frame, now_ns=now_ns, may_open=not decision.to_store)
-        except FOREIGN as error:
+        except foreign() as error:
             if self.open_again is None:
                 raise
             self._recover(error, now_ns=now_ns)
@@ -329,7 +329,7 @@ class BaseStage:
             error.__traceback__ = None  # its frames hold the encoder, and with it its device
             try:
                 self.encoder = self.open_again()
-            except FOREIGN as again:  # another failure of the same kind
+            except foreign() as again:  # another failure of the same kind
                 error = again
                 continue
             self._begins_anew = True

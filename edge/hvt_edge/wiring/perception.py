@@ -8,7 +8,7 @@ from typing import Literal, cast
 
 import numpy as np
 
-from hvt_common.errors import FOREIGN, UserError
+from hvt_common.errors import UserError, foreign
 from hvt_common.inference.detect import (
     Detector,
     FailingDetector,
@@ -173,7 +173,7 @@ def check_codecs(config: EdgeConfig) -> None:
         try:
             coded = codec.encode(crop, quality_pct=config.jpeg_quality, base_bgr=base)
             codec.decode(coded.data, size=(_TRIAL_PX, _TRIAL_PX), parameters=coded.parameters, base_bgr=base)
-        except FOREIGN as error:
+        except foreign() as error:
             raise UserError(
                 f"--{flag} {name} does not work here ({error}): choose another, such as jpeg"
             ) from error

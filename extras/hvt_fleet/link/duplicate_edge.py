@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import queue
 import threading
 import time
@@ -19,8 +18,6 @@ from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import READ_VERSIONS, Info, WireError
 from hvt_common.transport.session import query
 from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
-
-_log = logging.getLogger(__name__)
 
 _ANSWER_S = 1.0
 _ATTEMPT_S = 2.5
@@ -92,6 +89,5 @@ def _info(config: zenoh.Config, keys: EdgeKeys, *, answer_s: float) -> Info | No
                 return None
             answer = query(session, Channel.INFO, keys=keys, question=b"", timeout_s=answer_s)
             return None if answer is None else Info.parse(answer, versions=READ_VERSIONS)
-    except (zenoh.ZError, WireError) as error:
-        _log.debug("no edge of this id was found: %s", error)
+    except (zenoh.ZError, WireError):
         return None

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hvt_common.errors import FOREIGN, UserError
+from hvt_common.errors import UserError, foreign
 from hvt_common.protocol.messages import BacklogUnit, Info
 from hvt_common.runtime.statistics import Newest, SequenceWindow, StillSequenceWindow
 from hvt_common.units import SECOND_NS
@@ -165,7 +165,7 @@ class SessionBacklog:
         header = still.header
         try:
             self._read(still)
-        except FOREIGN:
+        except foreign():
             self._stills.forget(header.sequence)
             raise
         self._count(stills=1, at=(header.frame_index, header.capture_ns))
@@ -309,7 +309,7 @@ def read_still(still: ReceivedStill, take: Take, *, done: Done) -> Job:
                 receipt, new = target.receipt(), target.is_new_still(sequence)
                 if new:
                     target.read_still(still)
-    except FOREIGN as error:
+    except foreign() as error:
         done(_usable(error))
         raise
 
@@ -358,7 +358,7 @@ def show_video(units: Sequence[BacklogUnit], take: Take, *, worker: PerceptionWo
                 boxes = _find_boxes(units, logged.keys(), take)
                 if usable and logged and next(boxes, True) is None and not worker.submit(boxes, last=True):
                     boxes.close()
-    except FOREIGN as error:
+    except foreign() as error:
         finish(_usable(error))
         raise
     finish(usable)

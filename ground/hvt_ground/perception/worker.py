@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 
-from hvt_common.errors import FOREIGN
+from hvt_common.errors import foreign
 from hvt_common.runtime.failures import reason_of
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import Tracks
@@ -90,7 +90,7 @@ class _Worker:
             next(job)
         except StopIteration:
             return True
-        except FOREIGN as error:  # the picture of now goes on
+        except foreign() as error:  # the picture of now goes on
             self.jobs_failed += 1
             if self.jobs_failed.bit_count() == 1:
                 _log.warning(

@@ -186,8 +186,7 @@ class EdgePort:
                 on_answer=take,
                 on_end=on_end,
             )
-        except zenoh.ZError as error:
-            _log.debug("%s: nothing was asked on %s: %s", self.edge, row, error)
+        except zenoh.ZError:
             on_end()
 
     def _note_control(self, *, answered: bool) -> None:
@@ -197,15 +196,12 @@ class EdgePort:
             _log.warning("%s", control_unanswered(self.session, self.edge))
 
     def report(self, feedback: Feedback) -> None:
-        try:
-            with self._sending:
-                if self._closed:
-                    return
-                if self._feedback is None:
-                    self._feedback = declare_publisher(self.session, Channel.FEEDBACK, keys=self._keys)
-                self._feedback.put(feedback.pack())
-        except zenoh.ZError as error:
-            _log.debug("%s: feedback not sent: %s", self.edge, error)
+        with suppress(zenoh.ZError), self._sending:
+            if self._closed:
+                return
+            if self._feedback is None:
+                self._feedback = declare_publisher(self.session, Channel.FEEDBACK, keys=self._keys)
+            self._feedback.put(feedback.pack())
 
     def close(self) -> None:
         """No more comes, and nothing goes out."""

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Self
 
 from hvt_common import __version__
-from hvt_common.errors import FOREIGN
+from hvt_common.errors import foreign
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import (
     BASE_CODEC,
@@ -154,7 +154,7 @@ class EdgeSessions:
             if item is not None:
                 self.handle(item)
             self.housekeep(pending=pending)
-        except FOREIGN as error:  # it ends one session of one edge, whatever it is
+        except foreign() as error:  # it ends one session of one edge, whatever it is
             self._fail(error)
 
     def handle(self, item: Received) -> None:
@@ -176,10 +176,8 @@ class EdgeSessions:
     def close(self) -> None:
         """End the session that is open, and close the recordings of former ones."""
         self._end_session()
-        try:
-            self.backlog.close()
-        except Exception as error:  # noqa: BLE001 - the summaries are there all the same
-            self.failures.failed(f"recordings of former sessions of {self.port.edge}", reason_of(error))
+        # The summaries are there all the same.
+        self.failures.attempt(f"recordings of former sessions of {self.port.edge}", self.backlog.close, None)
 
     # Housekeeping
 
@@ -401,7 +399,6 @@ class EdgeSessions:
             if session.failure:
                 return  # one fault may come to light in several places
             session.failure = reason_of(error)
-        _log.debug("%s", self._part, exc_info=error)
         self.failures.failed(self._part, reason_of(error))
 
     def _is_over(self, session: Session, now_ns: int) -> bool:

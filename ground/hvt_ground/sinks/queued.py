@@ -15,7 +15,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from hvt_common.errors import FOREIGN, UserError
+from hvt_common.errors import UserError, foreign
 from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
@@ -234,9 +234,9 @@ class QueuedSink(Generic[T]):
                 if sink.path is not None and sink.path != self.files[-1]:
                     self.files.append(sink.path)
             sink.close(self._hurry)
-        except FOREIGN as error:  # everything else goes on
+        except foreign() as error:  # everything else goes on
             if sink is not None:
-                with suppress(Exception):
+                with suppress(BaseException):
                     sink.close(_AT_ONCE)
             self._fail(error)
             return False
@@ -289,7 +289,6 @@ class QueuedSink(Generic[T]):
         for done in lost:
             done(False)
         self._failed = self._failures.failed(self.part, reason_of(error), last=self._ending)
-        _log.debug("%s failed", self.part, exc_info=error)
 
 
 def is_stored(item: object) -> bool:

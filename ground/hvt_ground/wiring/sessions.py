@@ -23,7 +23,7 @@ from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.edge_backlog import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
-from hvt_ground.extras import Flight, Service, extras_of, locators, written
+from hvt_ground.extras import Flight, Service, extras_of, locators, part_of, written
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.recordings.row import RecordingRow
@@ -221,8 +221,8 @@ class SessionFactory:
         self._naming = threading.Lock()
         self._locator_of = locators(getattr(self.config, "terrain", None))
         self._extras = [
-            *(one.sinks for one in self.services),
-            *(extra.start(self.config, self.outputs) for extra in extras_of(self.config)),
+            *((part_of(one), one.sinks) for one in self.services),
+            *((part_of(one), one.start(self.config, self.outputs)) for one in extras_of(self.config)),
         ]
         self._timing: QueuedSink[str] | None = None
         if self.config.timing is not None:
@@ -265,7 +265,8 @@ class SessionFactory:
             new_file=partial(self._new_file, edge=edge, stamp=stamp),
             still_address=self._still_address(info, files.get("stills")),
         )
-        for one in chain.from_iterable(opens(flight) for opens in self._extras):
+        brought = (models.failures.attempt(part, opens, (), flight) for part, opens in self._extras)
+        for one in chain.from_iterable(brought):
             pause_s = one.longest_pause_s
             held_s = wait_s if one.waits else 0.0
             sinks.append(self.outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
@@ -319,7 +320,7 @@ class SessionFactory:
 
     def _recorded(self, row: RecordingRow) -> None:
         for one in self.services:
-            one.recorded(row)
+            self.models.failures.attempt(part_of(one), one.recorded, None, row)
 
     def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
         # A sink with a file; a name that could not be used is free again.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import time
+from collections.abc import Callable
+
+import pytest
 
 from hvt_common.runtime.failures import Failures, Retried, RetryPause, Turns
 from hvt_common.units import SECOND_NS
@@ -92,11 +94,37 @@ def test_a_part_that_takes_long_to_fail_has_not_worked_meanwhile():
     assert 8 <= len(opened) <= 13
 
 
-def test_a_part_that_exits_fails_like_one_that_raises():
-    """A plug-in that calls `sys.exit` ended the thread of perception for good: boxes stood, and nothing was said."""
+class Panic(BaseException):
+    """As of a part in Rust, or `asyncio`'s cancellation."""
+
+
+def raising(error: BaseException) -> Callable[[None], None]:
+    """What raises it."""
+
+    def run(_part: None) -> None:
+        raise error
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("error", "said"), [(SystemExit(3), "SystemExit: 3"), (Panic("one\ntwo"), "Panic: one two")]
+)
+def test_a_part_that_exits_or_panics_fails_like_one_that_raises(error: BaseException, said: str):
+    """Such a plug-in ended the thread of perception for good, or the ground: boxes stood, and nothing was said."""
     failures = Failures(time.time_ns)
-    assert Retried(lambda: None, "detector", failures).run(lambda _part: sys.exit(3)) is None
-    assert [one.reason for one in failures.now] == ["SystemExit: 3"]
+    assert Retried(lambda: None, "detector", failures).run(raising(error)) is None
+    assert [one.reason for one in failures.now] == [said]
+    with pytest.raises(KeyboardInterrupt):
+        Retried(lambda: None, "detector", failures).run(raising(KeyboardInterrupt()))
+
+
+def test_a_reason_is_one_line(caplog):
+    """A library that says a page would take the status line apart, and the table."""
+    failures = Failures(time.time_ns)
+    failures.failed("stills", "stopped (line one\n  line two" + 500 * "x")
+    assert failures.now[0].reason.startswith("stopped (line one line two")
+    assert len(failures.now[0].reason) == 300
 
 
 def test_of_parts_that_hang_in_one_another_the_inner_one_is_said():

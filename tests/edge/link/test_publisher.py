@@ -44,7 +44,7 @@ def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
             on_feedback=reports.append,
             on_info_request=requests.append,
         ),
-        failures=MagicMock(),
+        failures=Failures(lambda: 7),
         clock=lambda: 7,
     )
     report = session.declare_subscriber.call_args.args[1]
@@ -93,7 +93,7 @@ def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
         MagicMock(declare_subscriber=subscribe),
         EdgeKeys("uav-1"),
         answers,
-        failures=MagicMock(),
+        failures=Failures(lambda: 7),
         clock=lambda: round(now_s[0] * SECOND_NS),
     )
 

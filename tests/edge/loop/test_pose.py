@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from hvt_common.protocol.messages import PoseDecoder, PoseReport
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Pose
@@ -71,21 +73,37 @@ def test_where_there_is_none_it_says_so_and_goes_on():
     assert "has nothing at" in part.reason
 
 
-def test_an_error_in_the_source_of_poses_ends_no_flight():
+class Broken:
+    """Raises where a pose is asked for, or else where its trouble is."""
+
+    def __init__(self, error: BaseException | None) -> None:
+        self.error = error
+
+    @property
+    def trouble(self) -> str:
+        return str(1 // 0)
+
+    def at(self, media_ns, *, capture_ns):
+        if self.error is not None:
+            raise self.error
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("error", [ValueError("hm"), SystemExit(1), None])
+def test_an_error_in_the_source_of_poses_ends_no_flight(error):
     """Video would end over a message of the autopilot that nobody had thought of."""
-
-    class Broken:
-        trouble = ""
-
-        def at(self, media_ns, *, capture_ns):
-            raise ZeroDivisionError(f"at {media_ns} of {capture_ns}")
-
-        def close(self):
-            pass
-
-    sent, failures = fly(Broken(), seconds=3)
+    sent, failures = fly(Broken(error), seconds=3)
     assert sent.messages == []
-    assert "ZeroDivisionError" in failures.parts[0].reason
+    assert failures.parts[0].reason.startswith(type(error or ZeroDivisionError()).__name__)
+
+
+def test_where_none_is_expected_none_is_missed():
+    """The log said "pose: ; all else goes on"."""
+    table = PoseTable([Pose(0, 52.0, 13.0)])
+    table.at = lambda media_ns, *, capture_ns: None
+    assert fly(table, seconds=3)[1].parts == ()
 
 
 def test_a_number_that_cannot_be_said_is_named():

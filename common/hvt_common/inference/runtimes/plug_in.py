@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.errors import FOREIGN, UserError
+from hvt_common.errors import UserError, foreign
 from hvt_common.inference.letterbox import as_bgr
 from hvt_common.inference.nms import MAX_DETECTIONS
 from hvt_common.runtime.plug_ins import installed, loaded, origin, the_one
@@ -60,7 +60,7 @@ class PlugInDetector:
             if not self.class_names:
                 raise ValueError(f"its class_names are {names!r}, and have to be words")
             self.detect(np.full(_TRIAL, 128, np.uint8))
-        except FOREIGN as error:
+        except foreign() as error:
             raise UserError(
                 f"{_WHAT} {entry.name!r} of {origin(entry)} does not work: {type(error).__name__}: {error}"
             ) from error

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 
-from hvt_common.errors import FOREIGN, UserError
+from hvt_common.errors import UserError, foreign
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.runtime.failures import reason_of
@@ -110,7 +110,7 @@ def headroom_of(
             units = _coded(open_at(share), scene(), middle=frames // 2)
         except UserError:
             raise
-        except FOREIGN as error:
+        except foreign() as error:
             raise UserError(f"--encoder {name} does not work here ({reason_of(error)}): take x265") from error
         if not units:
             return share

@@ -6,7 +6,6 @@ the entities and for the ways in which the file stays small.
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -40,8 +39,6 @@ from hvt_ground.sinks.rerun.rrd_file import RrdFile
 from hvt_ground.sinks.rerun.sdk import RecordingId
 from hvt_ground.sinks.rerun.stills import StillRows
 from hvt_ground.sinks.rerun.tables import CodedIdentity, LogText, SizeLimit, TableRow
-
-log = logging.getLogger(__name__)
 
 ON_DEMAND = "asked"
 """The reason of a still that somebody asked for: its track is chosen."""
@@ -275,7 +272,6 @@ class Recorder(SinkWriter[Event]):
 
     def _sample(self, sample: VideoSample) -> list[TableRow]:
         if not sample.stored and not self._goes_on(sample):
-            log.debug("frame %d left out of the recording: not decodable there", sample.frame_index)
             return []
         size = len(sample.data)
         self._size_limit.received_bytes += size
