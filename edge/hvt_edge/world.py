@@ -6,10 +6,9 @@ import secrets
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from pathlib import Path
 from typing import cast
 
-from hvt_common.errors import FlightError, NotYetError, UserError, absent
+from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -19,7 +18,7 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink, ZenohLink
 from hvt_edge.loop.pose import PoseSource, PoseTable, open_pose
 from hvt_edge.source.demo import DemoSource
-from hvt_edge.source.opening import Source, is_local, open_source, shown
+from hvt_edge.source.opening import Source, open_source, shown
 from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_up_for
 
 
@@ -43,12 +42,8 @@ class World:
         warm_up_for(config, detector, source.view)
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """Open ``--source``. Raises `UserError` if nothing usable is there, `FlightError` if a disk may yet come."""
+        """Open ``--source``; errors are those of `hvt_edge.source.opening.open_source`."""
         assert config.source is not None, "check() refuses a missing source"
-        if is_local(config.source) and not config.follow and absent(Path(config.source)) is NotYetError:
-            raise FlightError(
-                f"--source {config.source} is in a folder that does not exist: is its disk mounted?"
-            )
         return open_source(
             config.source,
             size=base_size(config),

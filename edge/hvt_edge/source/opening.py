@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from hvt_common.errors import NotYetError, UserError
+from hvt_common.errors import FlightError, NotYetError, UserError, absent
 from hvt_common.redaction import HIDDEN, redacted
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -24,7 +24,7 @@ from hvt_edge.source.live import LiveSource, patience_s
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber, is_description
 from hvt_edge.source.video import VideoSource
 
-__all__ = ["REENCODE", "Source", "check_shape", "is_local", "open_source", "shown"]
+__all__ = ["REENCODE", "Source", "check_shape", "open_source", "shown"]
 
 _ACCEPTED = (
     "a video file, a folder of images, rtsp://…, rtmp://…, http://…, udp://…, FILE.sdp, /dev/videoN, demo or "
@@ -56,7 +56,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     is a live source's, Unix nanoseconds without steps, and ``failures`` records its outages; None for its own.
     A ``growing`` file is read while it grows. With ``coded`` each frame comes with the camera's own unit of it,
     at the camera's rate, whatever ``fps`` is.
-    Raises `UserError` if nothing usable is there, or size or rate are impossible.
+    Raises `UserError` if nothing usable is there, or size or rate are impossible, `FlightError` if a disk may yet come.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
     settings = SourceSettings(
@@ -114,6 +114,8 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
         known = scheme if re.fullmatch(r"[a-z][a-z0-9+.-]{0,15}", scheme) else HIDDEN
         raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
     if not _is_there(spec):
+        if not growing and absent(Path(spec)) is NotYetError:
+            raise FlightError(f"source {shown(spec)!r} is in a folder that does not exist: is its disk mounted?")
         kind = NotYetError if growing else UserError
         raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
     if growing and Path(spec).is_file() and not Path(spec).stat().st_size:

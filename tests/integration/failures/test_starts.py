@@ -202,6 +202,11 @@ def read_settings(path: str) -> object:
     return load(EdgeConfig, ("--config", path), program="hvt-edge", description="")
 
 
+def in_flight(source: str) -> object:
+    """As for a flight."""
+    return World().open_source(EdgeConfig(source=source))
+
+
 def read_keys(path: str) -> object:
     """As for a link."""
     return configure(LinkSettings("edge", zenoh_config=Path(path)))
@@ -218,11 +223,9 @@ def read_keys(path: str) -> object:
             id="no picture yet",
         ),
         pytest.param(lambda: open_source("clip.mp4", size=(64, 64), fps=5), UserError, id="no clip"),
-        pytest.param(
-            lambda: World().open_source(EdgeConfig(source="/not/mounted/a.mp4")),
-            FlightError,
-            id="no disk of clips",
-        ),
+        pytest.param(lambda: in_flight("/not/mounted/a.mp4"), FlightError, id="no disk of clips"),
+        pytest.param(lambda: in_flight("/dev/v4l/none/usb-1"), NotYetError, id="no device of that name"),
+        pytest.param(lambda: in_flight("v4l2src device=/none/0 ! appsink"), UserError, id="no clip but a pipe"),
         pytest.param(lambda: read_settings("/not/mounted/a.toml"), NotYetError, id="no disk of settings"),
         pytest.param(lambda: read_settings("none.toml"), UserError, id="no settings"),
         pytest.param(lambda: read_keys("/not/mounted/a.json5"), NotYetError, id="no disk of keys"),
