@@ -27,8 +27,9 @@ from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
 _OPEN_S = 10.0
-_UNDECODED_S = 10.0
-"""Longest time without a picture while packets come; without packets `patience_s` counts."""
+_UNDECODED_S, _FIRST_S = 10.0, 30.0
+"""Longest time without a picture while packets come, and before the first one: x264's default is a keyframe each 250
+pictures. Without packets `patience_s` counts."""
 _MOST_TIMES = 64
 
 _NEVER = (
@@ -134,21 +135,20 @@ def is_stamped(container: Any) -> bool:
 
 
 def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
-    # Undecodable packets are left out: joined between keyframes, or losses. FFmpeg's error after ten seconds of them.
+    # Undecodable packets are left out: joined between keyframes, or losses.
     times: dict[Fraction, int] = {}
-    whole_s, stamped = time.monotonic(), is_stamped(container)
+    until_s, stamped = time.monotonic() + _FIRST_S, is_stamped(container)
     for packet in packets_of(container, stream):
         camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
-        try:
+        decoded = []
+        with suppress(av.error.FFmpegError):
             decoded = packet.decode()
-        except av.error.FFmpegError:
-            if time.monotonic() - whole_s > _UNDECODED_S:
-                raise
-            continue
         if decoded:
-            whole_s = time.monotonic()
+            until_s = time.monotonic() + _UNDECODED_S
+        elif time.monotonic() > until_s:
+            raise SignalLost("what it sends gives no picture: does a keyframe come?")
         for coded in decoded:
             for frame in pictures.frames(coded):
                 base = frame.time_base

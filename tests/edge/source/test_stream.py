@@ -102,6 +102,25 @@ def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(tmp_path, m
         sender.join()
 
 
+def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch):
+    """The edge waited for ever, without a word: H.264 without its keyframe is no error to FFmpeg."""
+    seconds = itertools.count()
+    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
+    data = io.BytesIO()
+    with av.open(data, "w", format="matroska") as output:
+        film = output.add_stream("libx264", rate=25, options={"tune": "zerolatency", "g": "1000"})
+        film.width, film.height, film.pix_fmt = 128, 64, "yuv420p"
+        packets = [one for _ in range(200) for one in film.encode(av.VideoFrame(128, 64, "yuv420p"))]
+        output.mux(packets[1:])
+    connection = av.open(io.BytesIO(data.getvalue()))
+    monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)
+    camera = StreamGrabber("tcp://camera")
+    camera.open()
+    with pytest.raises(SignalLost, match="does a keyframe come"):
+        camera.grab()
+    camera.close()
+
+
 @pytest.mark.parametrize("coded", [False, True])
 @pytest.mark.parametrize(("fps", "waits_s"), [(15, 2), (0.3, 20 / 3), (0.01, 10)])
 def test_a_camera_that_is_as_slow_as_was_asked_is_not_gone(monkeypatch, fps, waits_s, coded):
