@@ -30,8 +30,11 @@ _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
 def sequence_files(folder: Path) -> list[Path]:
     """The images of a folder in natural order (img2 before img10), without hidden files and subfolders.
 
-    Of names that are times 9.05 comes before 9.5. Raises `UserError` for a folder that cannot be read.
+    Of names that are times 9.05 comes before 9.5; a file is its own only one. Raises `UserError` for a folder that
+    cannot be read.
     """
+    if folder.is_file():
+        return [folder]
     try:
         files = [file for file in folder.iterdir() if names_picture(file) and file.is_file()]
     except OSError as error:
@@ -90,7 +93,12 @@ class FolderSource(Source):
 
     def __init__(self, spec: str, settings: SourceSettings) -> None:
         self.fps = fps = settings.fps
-        self._files = [Path(spec)] if is_tiff(spec) else sequence_files(Path(spec))
+        self._place = Path(spec)
+        if settings.growing:
+            raise UserError(
+                f"source {spec!r} is no video file, and --follow waits for no other: leave it out"
+            )
+        self._files = sequence_files(self._place)
         if not self._files:
             endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
             raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
@@ -128,6 +136,9 @@ class FolderSource(Source):
                 image, shown = self._readable(place, held=image), place
                 frame = self._resizer.frame(image, index=index, capture_ns=capture_ns)
             yield replace(frame, index=index, capture_ns=capture_ns)
+        with suppress(UserError):  # it has gone meanwhile
+            if (more := len(sequence_files(self._place)) - len(self._files)) > 0:
+                _log.warning("%s: %d images came after the start and are not shown", self._place, more)
 
     def _readable(self, place: int, *, held: Image) -> Image:
         image = _bgr(self._files[place], self._stretch, at_s=float(place * self._period_s))

@@ -115,7 +115,9 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
         raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
     if not _is_there(spec):
         if not growing and absent(Path(spec)) is NotYetError:
-            raise FlightError(f"source {shown(spec)!r} is in a folder that does not exist: is its disk mounted?")
+            raise FlightError(
+                f"source {shown(spec)!r} is in a folder that does not exist: is its disk mounted?"
+            )
         kind = NotYetError if growing else UserError
         raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
     if growing and Path(spec).is_file() and not Path(spec).stat().st_size:

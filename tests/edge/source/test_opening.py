@@ -290,6 +290,16 @@ def test_a_picture_that_goes_while_the_folder_plays_is_skipped(tmp_path):
     assert len(set(means)) == 3
 
 
+def test_pictures_that_come_while_the_folder_plays_are_counted(tmp_path, caplog):
+    """They were left out without a word, with ``--follow`` too."""
+    cv2.imwrite(str(tmp_path / "1.png"), painted(1, size=(96, 64)))
+    with open_source(str(tmp_path), size=(96, 64), fps=10) as source:
+        cv2.imwrite(str(tmp_path / "2.png"), painted(2, size=(96, 64)))
+        assert len(list(source.frames(start_ns=0))) == 1
+    assert "1 images came after the start and are not shown" in caplog.text
+    assert "--follow waits for no other" in refused(str(tmp_path), growing=True)
+
+
 # -- demo ------------------------------------------------------------
 
 
