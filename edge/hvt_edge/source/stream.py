@@ -20,7 +20,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_common.units import SECOND_NS
 from hvt_edge.source.contract import Notes
-from hvt_edge.source.decoding.container import DEMUX_OPTIONS, WITHOUT_INDEX, cause_of, choose_stream, is_local
+from hvt_edge.source.decoding.container import DEMUX_OPTIONS, cause_of, choose_stream, is_local
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 
@@ -41,6 +41,8 @@ _STAMPED = frozenset({"mpegts", "rtsp", "rtp", "sdp", "flv"})
 """Formats whose time stamps are the sender's; for pictures in a row FFmpeg invents them."""
 _IN_SEGMENTS = "hls"
 """The format in which seconds come at once: each packet is held back until it is due by its own time."""
+_OF_NO_SIZE = ("_pipe", "jpeg", "hls", "sdp")
+"""Endings of the formats of which the size is one picture's, a description's, or invented by a camera."""
 _PLAYLIST = ".m3u8"
 _MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
 """A packet later or earlier than this sets the time for the next ones: after a stall, or a jump of the stamps."""
@@ -81,8 +83,8 @@ class StreamGrabber:
 
     @property
     def holds_a_clip(self) -> bool:
-        """Whether it has a known duration, or of MPEG-TS a size: a file behind an address, not a live stream."""
-        sized = self._container.format.name in WITHOUT_INDEX and self._container.size > 0
+        """Whether it has a known duration, or a size: a file behind an address, not a live stream."""
+        sized = self._container.size > 0 and not self._container.format.name.endswith(_OF_NO_SIZE)
         return sized or bool(self._container.duration)
 
     def restart(self) -> None:

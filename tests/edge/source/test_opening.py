@@ -455,8 +455,12 @@ def test_an_http_stream_plays_live_and_comes_back_after_it_ends(http_stream, cap
     assert not [thread for thread in threading.enumerate() if thread.name == "hvt-source"]
 
 
-def test_a_recording_that_a_server_sends_as_a_whole_is_a_clip(http_stream):
+@pytest.mark.parametrize("ending", ["ts", "mpg", "h264"])
+def test_a_recording_that_a_server_sends_as_a_whole_is_a_clip(tmp_path, http_stream, ending):
     """It was a camera that sends in bursts and stops each time: a few pictures of each minute, over and over."""
+    codec = "libx264" if ending == "h264" else "mpeg2video"
+    write_clip(tmp_path / f"a.{ending}", codec=codec, rate=25, count=200, size=(320, 240), bf=0)
+    Live.stream = (tmp_path / f"a.{ending}").read_bytes()
     with open_source(http_stream.replace("live", "whole"), size=(320, 180), fps=25) as source:
         assert not source.live
         assert len(list(source.frames(start_ns=0))) == 200

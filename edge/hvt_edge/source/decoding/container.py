@@ -50,7 +50,7 @@ DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
 _FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0", "m3u8_hold_counters": "3"}
 """An HLS playlist whose recorder has ended is read from its beginning, and polled thrice for more."""
 _PLAYLIST = ".m3u8"
-WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
+_WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
 _TS_BYTES = (188, 192, 204)
 """Size of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
@@ -321,7 +321,7 @@ class _Reading:
         )
         if joined and not self._stream.frames:
             return "another recording is behind it, in fragments that FFmpeg takes for those of the first"
-        ends = name in WITHOUT_INDEX or joined
+        ends = name in _WITHOUT_INDEX or joined
         behind = 1 - self._end_byte / size if size and ends else 0
         if behind > _MOST_BEHIND:
             return f"its last {behind:.0%} hold nothing of this film, but perhaps another recording"
