@@ -163,9 +163,10 @@ class LiveSource(Source):
 
     def close(self) -> None:
         """Stop the reader and join it; it answers within its read timeout."""
+        again = self._stop.is_set()
         self._end()
         self._thread.join(_JOIN_S)
-        if self._thread.is_alive():
+        if self._thread.is_alive() and not again:
             _log.warning("%s did not answer within %g s and is left behind", self._grabber.name, _JOIN_S)
 
     def _first_size(self, grabber: Grabber, size: BaseSize) -> tuple[int, int]:

@@ -303,3 +303,23 @@ def test_stamps_that_count_another_second_are_not_believed_for_long():
         for now_ns in (SECOND_NS * 1000 + number * SECOND_NS // 20,)
     ]
     assert max(late) <= 2.1 * SECOND_NS
+
+
+class Hangs(SaysItsTimeLater):
+    """After its first picture it does not answer."""
+
+    def grab(self) -> Shot:
+        if self.given:
+            self.ended.wait()
+        return super().grab()
+
+
+def test_a_camera_that_hangs_is_left_behind_with_one_sentence(monkeypatch, caplog):
+    """Ctrl-C closes it, and so does the end of the flight: the log said it twice."""
+    monkeypatch.setattr(live, "_JOIN_S", 0.01)
+    camera = Hangs()
+    source = LiveSource(camera, SMALL, clock=lambda: camera.now_ns)
+    source.close()
+    source.close()
+    camera.ended.set()
+    assert caplog.text.count("is left behind") == 1
