@@ -26,7 +26,7 @@ from hvt_edge.source.camera_stream import (
     without_jumps,
 )
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, SourceSettings
-from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
+from hvt_edge.source.live import IDLE_S, SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, packets_of
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
@@ -34,7 +34,6 @@ _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 MOST_OTHER_NS = 10 * SECOND_NS
 """A camera that sends pictures of another size or format for longer does not return to those of the start."""
 QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
-_IDLE_S = 1.0
 
 
 class CodedStreamGrabber(StreamGrabber):
@@ -107,7 +106,7 @@ class CodedLiveSource(LiveSource):
         count = 0
         while count != self._limit:
             with self._news:
-                self._news.wait_for(lambda: self._queue or self._stop.is_set(), _IDLE_S)
+                self._news.wait_for(lambda: self._queue or self._stop.is_set(), IDLE_S)
                 item = self._queue.popleft() if self._queue else None
                 self._queued_bytes -= 0 if item is None else len(item.packet.data)
             if self._stop.is_set():

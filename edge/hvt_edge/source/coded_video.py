@@ -22,14 +22,7 @@ from hvt_edge.source.camera_stream import (
     without_jumps,
 )
 from hvt_edge.source.contract import CameraStream, ClipSource, Notes, SeenUnit, SourceSettings
-from hvt_edge.source.decoding.container import (
-    name_of,
-    open_video,
-    packets_of,
-    said_rate,
-    survey,
-    without_stamps,
-)
+from hvt_edge.source.decoding.container import about_times, name_of, open_video, packets_of, survey
 from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer
 
@@ -72,11 +65,8 @@ class CodedVideoSource(ClipSource):
             self.fps = rate_of(self._name, seen, said=said)
             frames = stream.frames
             self.frame_count = None if not frames else min(frames, settings.max_frames or frames)
-            if without_stamps(stream) and settings.source_fps is None:
-                source = "as the stream itself says" if said_rate(stream) else "which is a guess"
-                notes(
-                    f"it has no time stamps: {said:.4g} frames a second, {source}; --source-fps N says another"
-                )
+            if settings.source_fps is None:
+                notes(about_times(stream, self._stamps))
             if self._hidden:
                 notes(
                     f"its edit list hides {self._hidden} of its pictures, and --encoder passthrough sends all: times"

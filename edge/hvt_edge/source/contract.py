@@ -169,8 +169,8 @@ class Notes:
         self._taken = False
 
     def __call__(self, sentence: str) -> None:
-        """Add the sentence, each once; after `taken` it is logged at once."""
-        if sentence in self._said:
+        """Add the sentence, each once, an empty one never; after `taken` it is logged at once."""
+        if not sentence or sentence in self._said:
             return
         self._said.append(sentence)
         if self._taken:

@@ -112,9 +112,8 @@ class FolderSource(Source):
             )
         if settings.source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
-        for said in (_gaps(self._files), _pages(shown)):
-            if said:
-                notes(said)
+        notes(_gaps(self._files))
+        notes(_pages(shown))
         self.notes = notes.taken()
         self._first = first
         self._period_s = 1 / exact_rate(fps if settings.source_fps is None else settings.source_fps)

@@ -56,7 +56,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     is a live source's, Unix nanoseconds without steps, and ``failures`` records its outages; None for its own.
     A ``growing`` file is read while it grows. With ``coded`` each frame comes with the camera's own unit of it,
     at the camera's rate, whatever ``fps`` is.
-    Raises `UserError` if nothing usable is there, or size or rate are impossible, `FlightError` if a disk may yet come.
+    Raises `UserError` if nothing usable is there, or size or rate are impossible; `FlightError` if a disk may come.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
     settings = SourceSettings(
@@ -147,14 +147,9 @@ def _is_there(spec: str, kind: Callable[[Path], bool] = Path.exists) -> bool:
 
 def _check_coded(spec: str) -> None:
     # Raise `UserError` for anything but coded video; whether it is HEVC is checked when it is open.
-    kinds = (
-        ("the drawn demo", is_demo(spec)),
-        ("a device", _is_device(spec)),
-        ("a folder", _is_there(spec, Path.is_dir)),
-    )
-    for kind, is_it in kinds:
-        if is_it:
-            raise UserError(
-                f"source {shown(spec)!r} is {kind}, and --encoder passthrough takes a video file or a stream that "
-                f"is HEVC already: {REENCODE}"
-            )
+    kind = "the drawn demo" * is_demo(spec) or "a device" * _is_device(spec)
+    if kind := kind or "a folder" * _is_there(spec, Path.is_dir):
+        raise UserError(
+            f"source {shown(spec)!r} is {kind}, and --encoder passthrough takes a video file or a stream that is "
+            f"HEVC already: {REENCODE}"
+        )

@@ -16,13 +16,12 @@ from hvt_common.units import exact_rate
 from hvt_common.values import Frame
 from hvt_edge.source.contract import ClipSource, Notes, SourceSettings
 from hvt_edge.source.decoding.container import (
+    about_times,
     decoded,
     duration_s,
     name_of,
     open_video,
-    said_rate,
     survey,
-    without_stamps,
 )
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.decoding.timeline import Stamps
@@ -51,8 +50,8 @@ class VideoSource(ClipSource):
                     f"source {self._name!r} holds a video stream of which no frame can be decoded"
                 )
             picture = self._pictures.bgr(shown[1])
-            for one in self._about_times(stream):
-                notes(one)
+            if self._override is None:
+                notes(about_times(stream, self._stamps))
         self.notes = notes.taken()
         shape = (picture.shape[1], picture.shape[0])
         self._resizer = Resizer(shape, settings.size, fit=settings.fit, name=self._name)
@@ -106,17 +105,6 @@ class VideoSource(ClipSource):
                 yield times.popleft(), whole
         for whole in self._pictures.frames(None):
             yield times.popleft(), whole
-
-    def _about_times(self, stream: Any) -> Iterator[str]:
-        fps = float(1 / self._stamps.period_s)
-        if self._override is not None:
-            return
-        if not self._stamps.usable:
-            why = "it has no time stamps" if without_stamps(stream) else "its time stamps do not rise"
-            said = "as the stream itself says" if said_rate(stream) else "which is a guess"
-            yield f"{why}: {fps:.4g} frames a second, {said}; --source-fps N says another rate"
-        elif stream.container.format.name == "avi" and stream.codec_context.has_b_frames:
-            yield "AVI has time stamps of the decoding alone: the n-th frame of the film is shown at the n-th of them"
 
     def _duration_s(self, stream: Any) -> Fraction | None:
         if self._override:

@@ -173,6 +173,22 @@ def said_rate(stream: Any) -> Fraction | None:
     return Fraction(rate) if rate and rate <= _MOST_FPS else None
 
 
+def about_times(stream: Any, stamps: Stamps) -> str:
+    """A guess at the frames' times, or what is odd about them, in a sentence; empty for nothing."""
+    fps = float(1 / stamps.period_s)
+    if not stamps.usable:
+        why = "it has no time stamps" if without_stamps(stream) else "its time stamps do not rise"
+        said = "as the stream itself says" if said_rate(stream) else "which is a guess"
+        return f"{why}: {fps:.4g} frames a second, {said}; --source-fps N says another rate"
+    if fps > _MOST_FPS:
+        return (
+            f"it says {fps:.6g} frames a second, of which most are left out; --source-fps N says another rate"
+        )
+    if stream.container.format.name == "avi" and stream.codec_context.has_b_frames:
+        return "AVI has time stamps of the decoding alone: the n-th frame of the film is shown at the n-th of them"
+    return ""
+
+
 def duration_s(stream: Any) -> Fraction | None:
     """The film's duration by the container; None where it has none.
 

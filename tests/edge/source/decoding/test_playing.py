@@ -98,6 +98,13 @@ def test_a_raw_stream_that_says_an_impossible_rate_is_guessed_at(tmp_path):
     assert "25 frames a second, which is a guess" in " ".join(source.notes)
 
 
+def test_a_rate_beyond_all_cameras_is_said(tmp_path):
+    """Of a film whose header has its clock in place of its rate, two pictures were shown, without a word."""
+    source, pictures = play(write_numbered(tmp_path / "a.mkv", 60, times_ms=list(range(60)), bf="0"))
+    assert len(pictures) == 2
+    assert "1000 frames a second, of which most are left out; --source-fps N" in " ".join(source.notes)
+
+
 def test_the_rate_of_jpegs_in_a_row_is_a_guess(tmp_path):
     """A recording of 30 frames a second, as a camera writes it, lasted longer, without a word."""
     film = b"".join(cv2.imencode(".jpg", numbered(number))[1].tobytes() for number in range(9))
