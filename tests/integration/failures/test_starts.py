@@ -225,7 +225,7 @@ def read_keys(path: str) -> object:
         pytest.param(lambda: open_source("clip.mp4", size=(64, 64), fps=5), UserError, id="no clip"),
         pytest.param(lambda: in_flight("/not/mounted/a.mp4"), FlightError, id="no disk of clips"),
         pytest.param(lambda: in_flight("/dev/v4l/none/usb-1"), NotYetError, id="no device of that name"),
-        pytest.param(lambda: in_flight("v4l2src device=/none/0 ! appsink"), UserError, id="no clip but a pipe"),
+        pytest.param(lambda: in_flight("v4l2src device=/none/0 ! appsink"), UserError, id="no clip: a pipe"),
         pytest.param(lambda: read_settings("/not/mounted/a.toml"), NotYetError, id="no disk of settings"),
         pytest.param(lambda: read_settings("none.toml"), UserError, id="no settings"),
         pytest.param(lambda: read_keys("/not/mounted/a.json5"), NotYetError, id="no disk of keys"),
