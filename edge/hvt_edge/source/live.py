@@ -25,7 +25,7 @@ from hvt_edge.source.resample import Gate, Resizer
 _log = logging.getLogger(__name__)
 
 FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
-_JOIN_S = 1.5
+JOIN_S = 1.5
 IDLE_S = 1.0
 LEAST_PATIENCE_S, _MOST_PATIENCE_S = 2.0, 10.0
 _MOST_PENDING = 8
@@ -165,9 +165,9 @@ class LiveSource(Source):
         """Stop the reader and join it; it answers within its read timeout."""
         again = self._stop.is_set()
         self._end()
-        self._thread.join(_JOIN_S)
+        self._thread.join(JOIN_S)
         if self._thread.is_alive() and not again:
-            _log.warning("%s did not answer within %g s and is left behind", self._grabber.name, _JOIN_S)
+            _log.warning("%s did not answer within %g s and is left behind", self._grabber.name, JOIN_S)
 
     def _first_size(self, grabber: Grabber, size: BaseSize) -> tuple[int, int]:
         del size

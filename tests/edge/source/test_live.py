@@ -316,7 +316,7 @@ class Hangs(SaysItsTimeLater):
 
 def test_a_camera_that_hangs_is_left_behind_with_one_sentence(monkeypatch, caplog):
     """Ctrl-C closes it, and so does the end of the flight: the log said it twice."""
-    monkeypatch.setattr(live, "_JOIN_S", 0.01)
+    monkeypatch.setattr(live, "JOIN_S", 0.01)
     camera = Hangs()
     source = LiveSource(camera, SMALL, clock=lambda: camera.now_ns)
     source.close()
