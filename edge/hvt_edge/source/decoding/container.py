@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -332,11 +333,13 @@ class _Reading:
     def _lacks_pictures(self) -> str:
         # The same for formats without an index, and for two joined MP4 files, by their bytes.
         name, size = self._container.format.name, self._size or 0
-        joined = (
-            "mp4" in name and _boxes_of(Path(self._container.name.removeprefix("file:"))).count(b"moov") > 1
-        )
+        boxes = _boxes_of(Path(self._container.name.removeprefix("file:"))) if "mp4" in name else []
+        joined = sum(kind == b"moov" for kind, _ in boxes) > 1
         if joined and not self._stream.frames:
             return "another recording is behind it, in fragments that FFmpeg takes for those of the first"
+        for before, later in pairwise(number for kind, number in boxes if kind == b"moof"):
+            if later > before + 1 and not joined:
+                return f"its fragments are not in a row: number {later} follows {before}"
         ends = name in _WITHOUT_INDEX or joined
         behind = 1 - self._end_byte / size if size and ends else 0
         if behind > _MOST_BEHIND:
@@ -378,7 +381,7 @@ def _decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
 
 def _lacks_index(path: Path) -> str:
     # The fault of an MP4 whose index is missing; empty for anything else.
-    kinds = _boxes_of(path)
+    kinds = [kind for kind, _ in _boxes_of(path)]
     if kinds[:1] != [b"ftyp"] or b"moov" in kinds:
         return ""
     return (
@@ -387,22 +390,22 @@ def _lacks_index(path: Path) -> str:
     )
 
 
-def _boxes_of(path: Path) -> list[bytes]:
-    # The kinds of the first boxes of an MP4 (ISO/IEC 14496-12, 4.2).
-    kinds: list[bytes] = []
+def _boxes_of(path: Path) -> list[tuple[bytes, int]]:
+    # The kinds of the first boxes of an MP4 (ISO/IEC 14496-12, 4.2), and of fragments their numbers (8.8.5).
+    boxes: list[tuple[bytes, int]] = []
     with suppress(OSError), path.open("rb") as file:
         end = path.stat().st_size
         at = 0
-        while at + 8 <= end and len(kinds) < _MOST_BOXES:
+        while at + 8 <= end and len(boxes) < _MOST_BOXES:
             file.seek(at)
-            head = file.read(16)
-            size, kind = int.from_bytes(head[:4], "big"), head[4:8]
-            kinds.append(kind)
+            head = file.read(24)
+            boxes.append((head[4:8], int.from_bytes(head[20:], "big")))
+            size = int.from_bytes(head[:4], "big")
             size = int.from_bytes(head[8:16], "big") if size == 1 else size
             if size < 8:
                 break
             at += size
-    return kinds
+    return boxes
 
 
 def _seconds(stamp: int | None, base: Fraction | None) -> Fraction | None:

@@ -93,6 +93,15 @@ def test_fragments_of_another_recording_are_said(tmp_path, caplog):
     assert "both.mp4 is unfinished: another recording is behind it" in caplog.text
 
 
+def test_a_fragment_that_is_missing_is_said(tmp_path, caplog):
+    """The picture stood still, without a word, where an upload had lost a part."""
+    write(tmp_path / "a.mp4", range(60), movflags="frag_keyframe+empty_moov+default_base_moof")
+    head, *fragments = (tmp_path / "a.mp4").read_bytes().split(b"moof")
+    (tmp_path / "a.mp4").write_bytes(b"moof".join([head, fragments[0], *fragments[2:]]))
+    play(tmp_path / "a.mp4")
+    assert "a.mp4 is unfinished: its fragments are not in a row: number 3 follows 1" in caplog.text
+
+
 def test_another_codec_in_the_midst_is_not_called_damage_alone(tmp_path, caplog):
     """Who looks for a fault of the disk or the link would look in vain."""
     write(tmp_path / "0.ts", range(30))
