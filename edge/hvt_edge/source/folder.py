@@ -30,8 +30,7 @@ _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
 def sequence_files(folder: Path) -> list[Path]:
     """The images of a folder in natural order (img2 before img10), without hidden files and subfolders.
 
-    Of names that are times 9.05 comes before 9.5; a file is its own only one. Raises `UserError` for a folder that
-    cannot be read.
+    Of names that are times 9.05 comes before 9.5; a file is its own only one. Raises `UserError` where it cannot.
     """
     if folder.is_file():
         return [folder]

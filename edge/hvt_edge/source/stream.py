@@ -28,8 +28,7 @@ LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "ud
 
 _OPEN_S = 10.0
 _UNDECODED_S, _FIRST_S = 10.0, 30.0
-"""Longest time without a picture while packets come, and before the first one: x264's default is a keyframe each 250
-pictures. Without packets `patience_s` counts."""
+"""Longest time without a picture while packets come, and before the first: x264 sends each 250 one a keyframe."""
 _MOST_TIMES = 64
 
 _NEVER = (

@@ -307,9 +307,11 @@ class _Reading:
         container, stream = self._container, self._stream
         if (size := _size_of(container)) != self._size:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
-        if self._ends_in_fragment():
-            return "its last fragment is cut"
         count, said = self._frames_there(), stream.frames
+        if (
+            "mp4" in container.format.name and not said and self._lacks_bytes()
+        ):  # in fragments it counts no frames
+            return "its last fragment is cut"
         if said and "mp4" in container.format.name:  # without frames hidden by an edit list
             said = len(stream.index_entries)
         if count < said and (self._lacks_bytes() or count < 0.98 * said - 2):
@@ -346,10 +348,6 @@ class _Reading:
             return f"its last {behind:.0%} hold nothing of this film, but perhaps another recording"
         broken = name == "mpegts" and all(size % one for one in _TS_BYTES)
         return "its last packet is cut" if broken else ""
-
-    def _ends_in_fragment(self) -> bool:
-        # Whether an MP4 in fragments, which counts no frames, ends within one.
-        return "mp4" in self._container.format.name and not self._stream.frames and self._lacks_bytes()
 
     def _lacks_bytes(self) -> bool:
         # Whether its index names places beyond its end.
