@@ -30,9 +30,9 @@ _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
 def sequence_files(folder: Path) -> list[Path]:
     """The images of a folder in natural order (img2 before img10), without hidden files and subfolders.
 
-    Of names that are times 9.05 comes before 9.5; a file is its own only one. Raises `UserError` where it cannot.
+    Of names that are times 9.05 comes before 9.5; a TIFF is its only one. Raises `UserError` for what cannot be read.
     """
-    if folder.is_file():
+    if is_tiff(str(folder)):
         return [folder]
     try:
         files = [file for file in folder.iterdir() if names_picture(file) and file.is_file()]
