@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -77,7 +79,8 @@ def _pages(file: Path) -> str:
     # A note that a file holds more than one picture; empty where it does not.
     count = 0
     with suppress(cv2.error):  # its header claims a size that no memory holds
-        count = cv2.imcount(str(file))
+        name: Any = os.fsencode(file)  # OpenCV dies of a text that is no UTF-8
+        count = cv2.imcount(name)
     return f"{file.name} holds {count} pictures: of a file the first alone is shown" if count > 1 else ""
 
 

@@ -27,7 +27,8 @@ from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import check_whole, names_of, option
 from hvt_study.commands.output import RunProgress, decimals, make_out, print_columns, writing
 from hvt_study.datasets.class_map import VEHICLE, VEHICLES
-from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
+from hvt_study.datasets.label_files import read_image
+from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures
 from hvt_study.datasets.labels import FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.judged import FrameView, Judged, judged

@@ -26,8 +26,8 @@ from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import names_of, option
 from hvt_study.commands.detect import detected, readable
 from hvt_study.commands.output import RunProgress, decimals, print_columns
-from hvt_study.datasets.label_files import LOOKED_IN
-from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
+from hvt_study.datasets.label_files import LOOKED_IN, read_image
+from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures
 from hvt_study.datasets.labels import IGNORED, FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.judged import LabelledFrame, judged

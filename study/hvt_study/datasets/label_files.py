@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import unicodedata
 from collections.abc import Iterator, Sequence
@@ -23,9 +24,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import cv2
+import numpy as np
+
 from hvt_common import files
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import numbered_names, read_labels
+from hvt_common.values import Image
 from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.annotation_rows import label_text
 from hvt_study.datasets.labels import FrameLabels, LabelDoubts
@@ -95,6 +100,22 @@ def pictures_below(place: Path) -> list[Path]:
         if labels.isdisjoint(folder.relative_to(first).parts)
         for file in sequence_files(folder)
     ]
+
+
+def read_image(path: Path, labelled_size: tuple[int, int] | None = None) -> Image | None:
+    """(height, width, 3) uint8 BGR; None where it is no picture that can be read.
+
+    It is turned as its EXIF tag says, but where it was labelled as it lies (``labelled_size``).
+    """
+    name: Any = os.fsencode(path)  # OpenCV dies of a text that is no UTF-8
+    image = cv2.imread(name, cv2.IMREAD_COLOR)
+    if image is not None and labelled_size == (image.shape[0], image.shape[1]) != (
+        image.shape[1],
+        image.shape[0],
+    ):
+        lying = cv2.imread(name, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = lying if lying is not None and lying.shape[:2] == labelled_size[::-1] else image
+    return None if image is None else np.asarray(image, np.uint8)
 
 
 def label_file(picture: Path, place: Path, folders: Folders) -> Path | None:

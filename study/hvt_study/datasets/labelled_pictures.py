@@ -16,12 +16,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-import cv2
-import numpy as np
-
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
-from hvt_common.values import Image
 from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.annotation_rows import LARGEST, label_text
 from hvt_study.datasets.label_files import (
@@ -190,21 +186,6 @@ def doubts_of(pictures: Sequence[LabelledPicture]) -> list[str]:
     for doubts in sets:
         doubts.check()
     return [sentence for doubts in sets for sentence in doubts.sentences()]
-
-
-def read_image(path: Path, labelled_size: tuple[int, int] | None = None) -> Image | None:
-    """(height, width, 3) uint8 BGR; None where it is no picture that can be read.
-
-    It is turned as its EXIF tag says, but where it was labelled as it lies (``labelled_size``).
-    """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is not None and labelled_size == (image.shape[0], image.shape[1]) != (
-        image.shape[1],
-        image.shape[0],
-    ):
-        lying = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        image = lying if lying is not None and lying.shape[:2] == labelled_size[::-1] else image
-    return None if image is None else np.asarray(image, np.uint8)
 
 
 def _has_commas(texts: Sequence[Path]) -> bool:

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
-from hvt_study.datasets.label_files import class_file, keypoint_columns, read_yolo, yolo_names
+from hvt_study.datasets.label_files import class_file, keypoint_columns, read_image, read_yolo, yolo_names
 from hvt_study.datasets.label_table import image_labels
 from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
 
@@ -145,13 +145,13 @@ class VirtualCamera:
     def __post_init__(self) -> None:
         if not self.picture_path.is_file():
             raise UserError(f"picture {self.picture_path} of {SCHEME} does not exist: give a picture file")
-        picture = cv2.imread(str(self.picture_path), cv2.IMREAD_COLOR)
+        picture = read_image(self.picture_path)
         if picture is None or min(picture.shape[:2]) < _LEAST_SIDE_PX:
             raise UserError(
                 f"picture {self.picture_path} is not one of at least {_LEAST_SIDE_PX}x{_LEAST_SIDE_PX} pixels: "
                 "give a JPEG or PNG file"
             )
-        self._picture = np.asarray(picture, np.uint8)
+        self._picture = picture
         high, wide = picture.shape[:2]
         # One aspect ratio for all pictures, that of the usual base stream.
         across = min(wide, high * 16 / 9) * self.view_heights

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from hvt_archive.reading.recorded import read_recordings
@@ -17,6 +16,7 @@ from hvt_common.errors import UserError
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_scene import CodeInView
+from hvt_study.datasets.label_files import read_image
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.demo.picture import Pair, Panel
@@ -88,12 +88,9 @@ def _stills(path: Path) -> list[FlownStill]:
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):  # a line an object, one picture
             x, y, w, h = (float(row[one]) for one in "xywh")
-            image = cv2.imread(str(path.with_name(row["file"])), cv2.IMREAD_COLOR)
-            if image is not None:
+            if (image := read_image(path.with_name(row["file"]))) is not None:
                 place = (x, y, x + w, y + h)
-                stills[row["file"]] = FlownStill(
-                    int(row["frame_index"]) + 1, place, np.asarray(image, np.uint8)
-                )
+                stills[row["file"]] = FlownStill(int(row["frame_index"]) + 1, place, image)
     return list(stills.values())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,7 +66,8 @@ def write_picture(path: Path, panels: Sequence[Panel], pairs: Sequence[Pair]) ->
     rows = [top, _legend(top.shape[1]), *([_beside([_pair(one) for one in pairs])] if pairs else [])]
     wide = max(one.shape[1] for one in rows)
     rows = [np.pad(one, ((0, 0), (0, wide - one.shape[1]), (0, 0)), constant_values=_PAPER) for one in rows]
-    if not cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_PNG_COMPRESSION, 9]):
+    name: Any = os.fsencode(path)  # OpenCV dies of a text that is no UTF-8
+    if not cv2.imwrite(name, np.vstack(rows), [cv2.IMWRITE_PNG_COMPRESSION, 9]):
         raise UserError(f"--picture {path} cannot be written: name another file")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,8 @@ from PIL import Image
 
 from hvt_common.errors import UserError
 from hvt_study.commands.detect import Finding, write_sheet
-from hvt_study.datasets.label_files import read_class_file
-from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
+from hvt_study.datasets.label_files import read_class_file, read_image
+from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures
 from hvt_study.datasets.labels import FrameLabels
 
 SIZE = (200, 100)
@@ -527,3 +528,10 @@ def test_a_table_or_a_route_beside_pictures_is_no_label(tmp_path: Path) -> None:
     text(tmp_path / "route.json", '{"type": "Point", "coordinates": [8, 47]}')
     text(tmp_path / "meta.json", '{"labels": ["day"]}')
     assert len(find_pictures(tmp_path, classes=None)) == 1
+
+
+def test_a_picture_with_a_name_of_latin_1_is_read(tmp_path):
+    """OpenCV ended the whole study in a segmentation fault."""
+    name = tmp_path / os.fsdecode(b"caf\xe9.png")
+    picture(tmp_path / "a.png").rename(name)
+    assert read_image(name) is not None

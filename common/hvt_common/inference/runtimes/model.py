@@ -314,6 +314,8 @@ def _session(
         )
     except _ort_errors() as error:
         raise UserError(f"model {path} cannot be opened: {_cause(path, error)}") from error
+    except TypeError:
+        raise UserError(f"model {path} cannot be opened: its name is not UTF-8, rename it") from None
     for value in (*session.get_inputs(), *session.get_outputs()):
         if not value.type.startswith("tensor("):
             raise UserError(

@@ -9,15 +9,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.resample import base_frame_count
 from hvt_edge.source.video import VideoSource
+from hvt_study.datasets.label_files import read_image
 from hvt_study.datasets.label_table import TableLabels
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
@@ -111,8 +109,7 @@ class ImageSequence:
 
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) in pixels; `UserError` for a file that cannot be decoded."""
-    data = np.fromfile(file, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    image = read_image(file)
     if image is None:
         raise UserError(f"{file} cannot be read as an image")
     return image.shape[1], image.shape[0]

@@ -424,3 +424,12 @@ def test_an_openvino_model_says_its_pixels(tmp_path: Path, said: str, expected: 
     (tmp_path / "m.xml").write_text(f"<net><rt_info><model_info>{said}</model_info></rt_info></net>")
     found = ir_metadata(tmp_path / "m.xml")
     assert {key: value for key, value in found.items() if key.startswith("hvt.")} == expected
+
+
+def test_a_model_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
+    """ONNX Runtime takes no such name: a traceback ended the start."""
+    name = constant_model(tmp_path / "m.onnx", np.ones((1, 2))).rename(
+        tmp_path / os.fsdecode(b"caf\xe9.onnx")
+    )
+    with pytest.raises(UserError, match="its name is not UTF-8, rename it"):
+        open_model(name, settings=ModelSettings(threads=1))
