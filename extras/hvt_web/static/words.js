@@ -85,8 +85,8 @@ export function standing(facts) {
   // Who comes later is shown a picture that may be old already.
   if (sinceMs > patience || ageMs > MOST_GAP_MS) return { state: "stale", words: `NO NEW PICTURE ${whole(Math.max(sinceMs, ageMs))}`, live: false };
   if (facts.lockstep) return { state: "live", words: "lockstep: no age", live: true };
-  // As old as it was when it came: the picture moves, and is not that of now.
-  if (ageMs - sinceMs > LATE_MS) return { state: "late", words: `LATE, ${seconds(ageMs)} old`, live: true };
+  // The picture moves, and is not that of now.
+  if (ageMs > LATE_MS) return { state: "late", words: `LATE, ${seconds(ageMs)} old`, live: true };
   return { state: "live", words: `live, ${age(ageMs)}`, live: true };
 }
 

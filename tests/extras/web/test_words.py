@@ -45,7 +45,7 @@ def test_what_is_not_live_never_says_live():
         ({}, "live, 0.3 s"),
         ({"lockstep": True}, "lockstep: no age"),
         ({"ageMs": 5_400}, "LATE, 5.4 s old"),
-        ({"ageMs": 2_400, "sinceMs": 900, "periodsMs": [1_000]}, "live, 2.4 s"),
+        ({"ageMs": 2_400, "sinceMs": 900, "periodsMs": [1_000]}, "LATE, 2.4 s old"),
         ({"ageMs": -40}, "live, 0.0 s"),
         ({"ageMs": -3_600_000}, "live, age not known"),
         ({"follows": False, "plays": False, "ageMs": 14_000}, "PAUSED 14 s"),
