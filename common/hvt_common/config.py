@@ -68,6 +68,22 @@ def _decimal(number: float) -> str:
 
 
 TEXT = SettingType("TEXT", _plain)
+
+
+def checked(check: Callable[[str], object]) -> SettingType:
+    """Text that ``check`` takes; its `UserError` says what the text is, then the text in quotes, and the rest."""
+
+    def parse(text: str, *, name: str) -> str:
+        _plain(text, name=name)
+        try:
+            check(text)
+        except UserError as error:
+            raise UserError(f"{name} {text!r}{str(error).partition(repr(text))[2]}") from None
+        return text
+
+    return SettingType(TEXT.metavar, parse)
+
+
 PLACE = SettingType("TEXT", _place)
 """A path, or a word or an address in its place."""
 PATH = SettingType("FILE", _path)

@@ -19,6 +19,7 @@ from hvt_common.config import (
     SIZE,
     TEXT,
     Group,
+    checked,
     choice,
     integer,
     number,
@@ -57,6 +58,7 @@ _R0_DEPTH = 0.1
 _MIN_BUDGET_BPS = 100_000
 _STORE_BYTES = 200_000_000
 _LEAST_STORE_BYTES = 10_000_000
+_CODEC = checked(still_codec)
 LEAST_FPS = 2.0
 """The lowest rate of ``--fps auto``: two frames in a window of a second."""
 _AUTO_FIRST_SHARE = 0.95
@@ -82,7 +84,7 @@ class EdgeConfig:
     source: str | None = _SOURCE.option(
         PLACE, None, "clip.mp4, folder/, rtsp://…, /dev/video0, demo or demo:codes,4k"
     )
-    edge_id: str = _SOURCE.option(TEXT, "edge-1", "name of this edge: 1 to 32 of a-z, 0-9 and -")
+    edge_id: str = _SOURCE.option(checked(EdgeKeys), "edge-1", "name of this edge: 1 to 32 of a-z, 0-9 and -")
     size: tuple[int, int] | str | None = _SOURCE.option(
         or_auto(SIZE),
         None,
@@ -178,10 +180,10 @@ class EdgeConfig:
         number(1, 100), 1.2, "within 5 x --cooldown another still only of a track this much larger or sharper"
     )
     still_codec: str = _SENT.option(
-        TEXT, "jpeg", "codec of stills; residual sends the difference to the base"
+        _CODEC, "jpeg", "codec of stills; residual sends the difference to the base"
     )
     fallback_codec: str = _SENT_RARE.option(
-        TEXT, "h264-intra", "codec of a still for which residual has no base picture, or is no smaller"
+        _CODEC, "h264-intra", "codec of a still for which residual has no base picture, or is no smaller"
     )
     jpeg_quality: int = _SENT.option(
         integer(5, 95), 65, "quality of the stills, in percent, whatever the codec"
@@ -232,7 +234,7 @@ class EdgeConfig:
         choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
     )
     tiles: str = _MODELS_RARE.option(
-        TEXT,
+        checked(parse_tiles),
         "off",
         "also detect in tiles of the source: COLUMNSxROWS such as 2x2, off, or auto, which in real time searches "
         "other scales too; search: in lockstep as well; needs --candidates source",
@@ -416,7 +418,6 @@ def check(config: EdgeConfig) -> EdgeConfig:
     """Return the configuration with regime and shares resolved; raises `UserError` where settings contradict."""
     if config.source is None:
         raise UserError("--source is missing: give a clip, an image folder, rtsp://…, /dev/video0 or demo")
-    EdgeKeys(config.edge_id)
     check_shape(size=config.fixed_size or DEFAULT_SIZE, fps=config.nominal_fps)
     if config.regime and (config.budget is not None or config.video_share is not None):
         raise UserError(

@@ -8,7 +8,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from hvt_common.config import checked
 from hvt_common.errors import Parser, UserError
+from hvt_common.protocol.channels import EdgeKeys
 from hvt_common.runtime.reporting import check_writable, say
 from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s
 from hvt_ground.control import EdgeClient, RemoteEdge, RequestedStill, check_suffix
@@ -20,6 +22,8 @@ def run(argv: Sequence[str]) -> int:
     """Run one command; `UserError` where an edge refuses it or the user can mend something."""
     arguments = _parser().parse_args(argv)
     do = _prepare(arguments)
+    if getattr(arguments, "edge", None) is not None:
+        checked(EdgeKeys).parse(arguments.edge, name="--edge")
     with EdgeClient.connect(*arguments.connect, zenoh_config=arguments.zenoh_config) as edges:
         if arguments.command == "edges":
             names = edges.names()

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import FlightError
-from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import reason_of
 from hvt_common.runtime.plug_ins import health_server
@@ -94,7 +93,6 @@ class Ground:
         seconds.
         """
         config = self._config
-        check_edge_pattern(config.edges)
         check_outputs(config, records=self._program is None)
         models = Models(config)
         with ExitStack() as stack:

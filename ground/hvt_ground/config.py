@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
+from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, checked, choice, integer, number
 from hvt_common.errors import UserError, check_apart
 from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, parts_of
-from hvt_common.protocol.channels import GroupKeys
+from hvt_common.protocol.channels import GroupKeys, check_edge_pattern
 from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_common.units import Limit, parse_limit
@@ -46,9 +46,11 @@ class GroundConfig:
         integer(1, 2), 1, "2: where it connects, one Zenoh link for urgent messages and one for the rest"
     )
     insecure: bool = _LINK.switch("allow listening beyond this machine without keys")
-    edges: str = _LINK.option(TEXT, "*", "which edges to serve, for example 'uav-*'")
+    edges: str = _LINK.option(checked(check_edge_pattern), "*", "which edges to serve, for example 'uav-*'")
     group: str | None = _LINK_RARE.option(
-        TEXT, None, "share the edges with all grounds of this group: each edge is served by one of them"
+        checked(GroupKeys),
+        None,
+        "share the edges with all grounds of this group: each edge is served by one of them",
     )
     once: bool = _LINK.switch("end when the edges have ended")
     wait: float = _LINK.option(
@@ -190,8 +192,6 @@ def check(config: GroundConfig, *, more: Iterable[Written] = ()) -> GroundConfig
         if path.suffix == (suffix or path.suffix)
     )
     check_apart(files)  # files in a folder have names of their own
-    if config.group is not None:
-        GroupKeys(config.group)
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):

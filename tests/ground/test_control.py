@@ -238,7 +238,8 @@ def test_the_other_commands_ask_what_they_say(edge, words, asked):
         (["still", "--box", "1,2,3,4", "--track", "5", "--out", "a.png"], "not allowed with"),
         (["still", "--at", "soon", "--out", "a.png"], "--at 'soon' is not a duration"),
         (["set-budget", "much"], "the budget 'much' is not a bitrate"),
-        (["keyframe", "--connect", "nowhere"], "endpoint 'nowhere' is not usable"),
+        (["keyframe", "--edge", "UAV 1"], "--edge 'UAV 1' is not usable"),
+        (["keyframe", "--connect", "nowhere"], "--connect 'nowhere' is not usable"),
         (["still", "--track", "x", "--out", "a.png"], "is not accepted: give a whole number"),
     ],
 )

@@ -106,7 +106,8 @@ PLACES = (
         (f"{KEEPS} 1h --keep 2h", ["--keep 3600s and --keep 7200s are both given"]),
         (f"{KEEPS} 1GB --keep 2GB", ["both given: give one time and one size"]),
         *((f"--listen tcp/{host}:7999", [host, "--insecure"]) for host in ("0.0.0.0", "[::]")),
-        *((f"--edges '{pattern}'", ["edge", pattern]) for pattern in ("UAV_*", "", "a/b", "**/x")),
+        *((f"--edges '{pattern}'", [f"--edges '{pattern}'"]) for pattern in ("UAV_*", "a/b", "**/x")),
+        ("--group 'A B'", ["--group 'A B'"]),
         ("--view --serve", ["--view and --serve are both given"]),
         *((word, [word]) for word in ("--bogus", "stray")),
         *((f"--cot '{url}'", [redacted(url), "--cot", "tls://HOST:PORT"]) for url in PLACES),
@@ -125,7 +126,7 @@ def test_files_of_settings_that_are_wrong(ground, here):
     Path("ground.toml").write_text("sauce = 'tomato'\n")
     assert "unknown key 'sauce'" in ground("--config", "ground.toml")
     Path("zenoh.json5").write_text("{ mode: ")
-    assert "zenoh.json5:1: not JSON5" in ground("--zenoh-config", "zenoh.json5")
+    assert "zenoh.json5:1 is not JSON5" in ground("--zenoh-config", "zenoh.json5")
 
 
 def test_a_classifier_with_no_class_in_common(ground, tmp_path):

@@ -97,8 +97,9 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     if not (listen or connect or file_listen or _endpoints(said, "connect")):
         listen = (DEFAULT_ENDPOINT,) if settings.role == "ground" else ()
         connect = () if settings.role == "ground" else (DEFAULT_ENDPOINT,)
-    for endpoint in (*listen, *connect):
-        _check_endpoint(endpoint)
+    for side, endpoints in (("listen", listen), ("connect", connect)):
+        for endpoint in endpoints:
+            _check_endpoint(endpoint, side)
     if listen or not file_listen:
         # Never Zenoh's own default: a peer that listens on every address.
         _insert_endpoints(config, "listen", listen)
@@ -142,21 +143,25 @@ def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
     try:
         text = read_text(path)
     except OSError as error:
-        raise absent(path)(f"{path}: cannot read the Zenoh configuration: {error.strerror}") from None
+        raise absent(path)(
+            f"--zenoh-config {path} cannot be read ({error.strerror}): give a JSON5 file"
+        ) from None
     try:
         said = json5.loads(text)
     except (ValueError, RecursionError) as error:
         line, reason = _located(str(error))
-        raise UserError(f"{path}{line}: not JSON5: {reason}") from None
+        raise UserError(f"--zenoh-config {path}{line} is not JSON5: {reason}") from None
     if not isinstance(said, dict):
         raise UserError(
-            f"{path}: a Zenoh configuration is an object in braces, this is a {type(said).__name__}"
+            f"--zenoh-config {path} is a {type(said).__name__}: give Zenoh's settings, an object in braces"
         )
     try:
         return zenoh.Config.from_json5(text), said
     except zenoh.ZError as error:
         reason = without_build_paths(str(error))
-        raise UserError(f"{path}{_line_of(reason, text)}: Zenoh does not accept it: {reason}") from None
+        raise UserError(
+            f"--zenoh-config {path}{_line_of(reason, text)} is not accepted by Zenoh: {reason}"
+        ) from None
 
 
 def _mentions(said: dict[str, Any], path: str) -> bool:
@@ -213,11 +218,11 @@ _IFACE = re.compile(r"(\[fe[89ab][^%\]]*)(\][^#]*)#(?:.*;)?iface=([^;]+).*", re.
 """Of ``[fe80::1%eth0]`` Zenoh knows numbers alone, which change with the interface; here it knows names."""
 
 
-def _check_endpoint(endpoint: str) -> None:
+def _check_endpoint(endpoint: str, side: str) -> None:
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None or not 1 <= int(found["port"]) <= 65535:
         raise UserError(
-            f"endpoint {endpoint!r} is not usable: PROTOCOL/HOST:PORT is accepted, such as {DEFAULT_ENDPOINT}, "
+            f"--{side} {endpoint!r} is not usable: PROTOCOL/HOST:PORT is accepted, such as {DEFAULT_ENDPOINT}, "
             "with tcp, tls, udp, quic or ws and a port of 1 to 65535"
         )
 

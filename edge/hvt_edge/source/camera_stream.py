@@ -258,7 +258,7 @@ def check_picture(name: str, picture: av.VideoFrame, *, size: BaseSize) -> str:
     try:
         check_shape(size=has, fps=1)
     except UserError as error:
-        raise UserError(f"source {name}: {error}; {REENCODE}") from error
+        raise UserError(f"source {name}: its {str(error).removeprefix('--')}; {REENCODE}") from error
     if turn := turn_of(picture):
         raise UserError(
             f"source {name} is to be shown {turn}, and --encoder passthrough sends it as it is coded: {REENCODE}"

@@ -149,14 +149,14 @@ def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) 
     # HEVC codes 4:2:0 pictures in even sizes only.
     if wide % 2 or high % 2 or not all(_LEAST_SIDE_PX <= side <= _MOST_SIDE_PX for side in (wide, high)):
         raise UserError(
-            f"size {wide}x{high} is impossible: width and height must be even and between {_LEAST_SIDE_PX} and "
+            f"--size {wide}x{high} is impossible: width and height must be even and between {_LEAST_SIDE_PX} and "
             f"{_MOST_SIDE_PX}"
         )
     if not (math.isfinite(fps) and 0 < fps <= 240):
-        raise UserError(f"fps {fps:g} is impossible: accepted is above 0 and at most 240 frames a second")
+        raise UserError(f"--fps {fps:g} is impossible: accepted is above 0 and at most 240 frames a second")
     if source_fps is not None and not (math.isfinite(source_fps) and 0 < source_fps <= 1000):
         raise UserError(
-            f"source-fps {source_fps:g} is impossible: accepted is above 0 and at most 1000 frames a second"
+            f"--source-fps {source_fps:g} is impossible: accepted is above 0 and at most 1000 frames a second"
         )
 
 

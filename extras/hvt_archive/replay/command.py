@@ -23,7 +23,7 @@ from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.replay.message_log import read_log
 from hvt_common.config import load
 from hvt_common.errors import Parser, UserError
-from hvt_common.protocol.channels import Channel, EdgeKeys, check_edge_pattern, matches, parse_key
+from hvt_common.protocol.channels import Channel, EdgeKeys, matches, parse_key
 from hvt_common.protocol.messages import (
     READ_VERSIONS,
     BaseHeader,
@@ -226,7 +226,6 @@ class _Replay:
 
     def run(self) -> list[dict[str, Any]]:
         """Play all of it; a summary a session."""
-        check_edge_pattern(self._config.edges)
         infos = _infos(self._messages())
         make_folders(self._config)
         models = Models(self._config)

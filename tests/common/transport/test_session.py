@@ -263,19 +263,19 @@ def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('{\n mode: "peer",\n foo: ]\n}', r"zenoh\.json5:3: not JSON5: Unexpected .\]. at column 7$"),
-        ("{", r"zenoh\.json5(:\d+)?: not JSON5: "),
-        ("[]", r"zenoh\.json5: a Zenoh configuration is an object in braces, this is a list$"),
+        ('{\n mode: "peer",\n foo: ]\n}', r"zenoh\.json5:3 is not JSON5: Unexpected .\]. at column 7$"),
+        ("{", r"zenoh\.json5(:\d+)? is not JSON5: "),
+        ("[]", r"zenoh\.json5 is a list: give Zenoh's settings, an object in braces$"),
         (
             "{\n transport: {\n  unicast: { max_linkss: 2 } } }",
-            r"zenoh\.json5:3: Zenoh does not accept it: unknown field `max_linkss`$",
+            r"zenoh\.json5:3 is not accepted by Zenoh: unknown field `max_linkss`$",
         ),
-        ('{\n mode: "pear" }', r"zenoh\.json5:2: Zenoh does not accept it: unknown variant `pear`$"),
+        ('{\n mode: "pear" }', r"zenoh\.json5:2 is not accepted by Zenoh: unknown variant `pear`$"),
         (
             '{ listen: { endpoints: ["tcp"] } }',
-            r"zenoh\.json5: Zenoh does not accept it: .*Endpoints must be",
+            r"zenoh\.json5 is not accepted by Zenoh: .*Endpoints must be",
         ),
-        ("[" * 100_000, r"zenoh\.json5: not JSON5: "),
+        ("[" * 100_000, r"zenoh\.json5 is not JSON5: "),
     ],
 )
 def test_a_broken_file_is_one_sentence_with_its_line(tmp_path, text, said):
@@ -290,7 +290,7 @@ def test_a_broken_file_is_one_sentence_with_its_line(tmp_path, text, said):
 
 def test_a_file_that_cannot_be_read_is_one_sentence(tmp_path):
     """The user would see a traceback for a typo in a name."""
-    with pytest.raises(UserError, match=r"nowhere\.json5: cannot read the Zenoh configuration: No such file"):
+    with pytest.raises(UserError, match=r"--zenoh-config .*nowhere\.json5 cannot be read \(No such file"):
         configure(LinkSettings("edge", zenoh_config=tmp_path / "nowhere.json5"))
     with pytest.raises(UserError, match="Is a directory"):
         configure(LinkSettings("edge", zenoh_config=tmp_path))

@@ -164,7 +164,7 @@ def test_what_cannot_be_is_said_in_one_sentence(drawn, tmp_path, capsys):
         ),
         (["replay", log, "--speed", "0"], "--speed 0 is not accepted"),
         (["replay", log, "--detector", str(tmp_path / "absent.onnx")], "absent.onnx"),
-        (["replay", log, "--edges", "UAV"], "edge pattern 'UAV' is not usable"),
+        (["replay", log, "--edges", "UAV"], "--edges 'UAV' is not usable"),
         (
             ["replay", log, "--edges", "nobody", "--detector", "motion", "--classifier", "none"],
             "flight.hvtlog has no session that can be shown, of an edge that --edges nobody names",
