@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 from rich.table import Table
@@ -46,7 +47,8 @@ def _table(state: dict[str, Any]) -> Table:
         if one["session"] and one["session"].get("edge_frames")
     ]
     said += ["detector loading"] * state.get("loading", False)
-    said += [f"{one['part']}: {one['reason']}" for one in state["failed"]]
+    parts = chain(state["failed"], *(one["failed"] for one in state["edges"]))
+    said += [f"{one['part']}: {one['reason']}" for one in parts]
     table.caption = "; ".join(said) or None
     return table
 

@@ -117,14 +117,10 @@ class Receiver:
         self._uptime = Uptime()
         self._captures = CaptureTimes()
         self._last_message_ns = time.monotonic_ns()
-        self._damaged = 0
-        self.of_other_versions = 0
-        """Messages that were skipped for their schema version."""
-
-    @property
-    def unusable(self) -> int:
+        self.unusable = 0
         """Messages that were skipped: damaged, foreign, or of another version."""
-        return self._damaged + self.of_other_versions
+        self.other_version = ""
+        """The remedy, as a sentence, where the newest message is of another version."""
 
     @property
     def silent_ns(self) -> int:
@@ -133,7 +129,7 @@ class Receiver:
 
     def receive(self, item: Received) -> Sequence[Arrival[Received] | Packet]:
         """The packets of one message: none if it is unusable or waits, several if it fills a hole."""
-        self._last_message_ns = time.monotonic_ns()
+        self._last_message_ns, self.other_version = time.monotonic_ns(), ""
         at_ns = self._uptime.handle(arrived_ns=item.received_ns, now_ns=self._clock())
         parsed = parse_key(item.key)
         row = parsed[1] if parsed else None
@@ -209,20 +205,17 @@ class Receiver:
         return text
 
     def skip(self, row: str, error: WireError) -> None:
-        """Count an unusable message; those of another version apart, which are said once."""
+        """Count an unusable message."""
+        self.unusable += 1
         if isinstance(error, UnknownVersionError):
-            self.of_other_versions += 1
-            if self.of_other_versions == 1:
-                _log.warning("%s", error.between(f"edge {self._edge}", "this ground"))
-            return
-        self._damaged += 1
-        if self._damaged.bit_count() == 1:  # 1, 2, 4, 8 …: a flood does not fill the log
-            _log.warning("%s: %s message unusable (%d so far): %s", self._edge, row, self._damaged, error)
+            self.other_version = error.between(f"edge {self._edge}", "this ground")
+        elif self.unusable.bit_count() == 1:  # 1, 2, 4, 8 …: a flood does not fill the log
+            _log.warning("%s: %s message unusable (%d so far): %s", self._edge, row, self.unusable, error)
 
     def skip_stranger(self, row: str, session_id: int) -> None:
         """Count a message of a session that is not open."""
         if session_id == self._other:  # of which enough has been said
-            self._damaged += 1
+            self.unusable += 1
         else:
             self.skip(row, WireError(f"it belongs to the session {session_id:08x}, which is not shown"))
 

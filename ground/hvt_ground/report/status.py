@@ -25,7 +25,8 @@ def status_text(state: GroundState) -> str:
 def _edge_text(one: EdgeState) -> str:
     session = one.session
     if session is None:
-        said = f"{one.edge}: {'ended' if one.link == 'ended' else 'waiting for a keyframe'}"
+        waits = "; ".join(part.reason for part in one.failed) or "waiting for a keyframe"
+        said = f"{one.edge}: {'ended' if one.link == 'ended' else waits}"
     elif one.link == "lost":
         said = f"{one.edge}: {session.duration_s:.1f} s  LINK LOST for {one.silent_s:.0f} s"
     else:

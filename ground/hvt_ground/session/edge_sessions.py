@@ -45,6 +45,10 @@ _BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After a pause of chunks this long the recording says how much of the backlog came."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
 """Time between two queries of the edge's clock."""
+_NO_PICTURE = (
+    "the edge sends pictures, and only small messages come: something on the way drops large packets (lower the MTU "
+    "of the tunnel, docs/deployment.md), or the link is too slow for a picture"
+)
 _BURST, _EVERY_NS = 30, 5 * SECOND_NS
 """Up to 30 sessions begin at once, then one in 5 s: each is a file, and has a log of its own."""
 
@@ -161,6 +165,8 @@ class EdgeSessions:
         """Take one message; raises whatever goes wrong with it."""
         for packet in self.receiver.receive(item):
             self._route(packet)
+        if self.session is None and self.receiver.other_version:
+            self._say_unseen(self.receiver.other_version)
         self._note_held()
 
     def _note_held(self) -> None:
@@ -196,7 +202,7 @@ class EdgeSessions:
         if session is not None:
             self._serve(session, now_ns)
         elif self.receiver.silent_ns > self._patience_ns:
-            self._say_unseen(self.receiver.is_unseen(None, now_ns))
+            self._say_unseen(_NO_PICTURE if self.receiver.is_unseen(None, now_ns) else "")
 
     def _serve(self, session: Session, now_ns: int) -> None:
         if session.take_resumed():
@@ -270,7 +276,7 @@ class EdgeSessions:
             ):
                 self.receiver.hold(packet)  # it may overtake the first keyframe of its session
                 if isinstance(header, Status) and session is None:
-                    self._say_unseen(self.receiver.is_unseen(header, item.received_ns))
+                    self._say_unseen(_NO_PICTURE if self.receiver.is_unseen(header, item.received_ns) else "")
             elif isinstance(header, TrackStep) and session is None:
                 pass  # who joins between two keyframes gets some; the next ones say all of it again
             else:
@@ -278,16 +284,12 @@ class EdgeSessions:
         except WireError as error:
             self.receiver.skip(row, error)
 
-    def _say_unseen(self, unseen: bool) -> None:  # noqa: FBT001 - an answer
-        if not unseen:
+    def _say_unseen(self, reason: str) -> None:
+        if not reason:
             self.failures.over(self._video, self._unseen_failure)
             self._unseen_failure = 0
         elif not self._unseen_failure:
-            self._unseen_failure = self.failures.failed(
-                self._video,
-                "the edge sends pictures, and only small messages come: something on the way drops large packets "
-                "(lower the MTU of the tunnel, docs/deployment.md), or the link is too slow for a picture",
-            )
+            self._unseen_failure = self.failures.failed(self._video, reason)
 
     def _base(self, arrival: Arrival[Received]) -> None:
         session_id = arrival.header.session_id

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -154,6 +155,25 @@ def test_an_edge_of_which_all_but_the_pictures_comes_is_named(flight, tmp_path, 
     assert rig.sessions.join()
 
 
+def test_an_edge_of_another_version_is_said_where_its_picture_would_be(flight, tmp_path):
+    """A pilot would wait for a keyframe for ever, and find the reason in the log of the ground alone."""
+    rig = Unseen(flight, Consumer(tmp_path))
+    unit = flight.base(0)
+    body = b"%c\x06%s" % (unit.attachment[0], unit.attachment[2:-5])
+    later = replace(unit, attachment=body + b"\xce" + zlib.crc32(body + unit.payload).to_bytes(4, "big"))
+    rig.inbox.put(later)
+    eventually(lambda: rig.inbox.handled, what="it is handled")
+    said = "edge uav-1 speaks wire version 6, this ground reads 5: update this ground"
+    assert rig.said.startswith(f"uav-1: {said}  video of uav-1 FAILED at")
+    rig.put(0)
+    assert "FAILED" not in rig.said
+    rig.inbox.put(later)
+    eventually(lambda: rig.inbox.handled, what="a second edge of that name is counted")
+    assert "FAILED" not in rig.said
+    assert rig.sessions.receiver.unusable == 2
+    assert rig.sessions.join()
+
+
 @pytest.mark.parametrize("how", ["ended", "damaged", "silent"])
 def test_the_pictures_of_an_edge_fail_no_longer_than_it_sends_them(flight, tmp_path, how):
     """Hours after a flight the page would say that its video has failed."""
@@ -250,7 +270,7 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert rig.sessions.idle
     (failed,) = rig.sessions.failures.parts
     assert failed.reason == "OSError: [Errno 28] No space left on device"
-    assert "waiting for a keyframe  session of uav-1 FAILED at" in status_text(
+    assert f"uav-1: {failed.reason}  session of uav-1 FAILED at" in status_text(
         StateMaker(time.time_ns).make([("uav-1", rig.sessions)])
     )
     requests = rig.port.keyframe_requests
