@@ -72,6 +72,8 @@ class EdgePort:
         """Set while the edge's liveliness token is there."""
         self.used = threading.Event()
         """Set while there is more to this edge than messages under its name: a session that is open."""
+        self.has_sent = False
+        """Any message at all: a token alone costs its maker nothing."""
         self.reported_ns = 0
         """When its newest report came; 0 before the first."""
         self._unanswered = self._unusable = 0
@@ -140,6 +142,7 @@ class EdgePort:
 
     def put(self, item: Received, row: Channel) -> None:
         """Take a message in, or drop it: without room, or where an edge reports without end."""
+        self.has_sent = True
         if row == Channel.STATUS:
             self.reported_ns = item.received_ns
             if not self._reports.take(item.received_ns):

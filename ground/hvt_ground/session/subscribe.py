@@ -25,9 +25,9 @@ _log = logging.getLogger(__name__)
 
 MAX_EDGES = 64
 """More edge ids than this are not served: each costs a thread, and ids cost a sender nothing. One that shows its
-token takes the place of one that has neither a token nor a session."""
-_MOST_SHARED = 16384
-"""Edges of all members of a group together."""
+token takes the place of one that has neither a token nor a session; one that sends, too, of one that never has."""
+_MOST_ALIVE = 16384
+"""Tokens that are remembered, of edges of all members of a group together."""
 _QUIET_NS, _MOST_QUIET_NS = 2 * SECOND_NS, 64 * SECOND_NS
 """The time that a present edge may send nothing; the longest pause before its subscriptions are made again."""
 _SUBSCRIBED = (
@@ -61,9 +61,7 @@ class GroundLink:
         self._group = group
         self._log = log
         self._alive: set[str] = set()
-        """Edges that show their token, also those that others serve; with a group."""
-        self._unplaced: set[str] = set()
-        """Edges that show their token and found no place; the first `MAX_EDGES` of them."""
+        """Edges that show their token, also those that others serve, or that found no place."""
         self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
         """Subscriptions by edge: all with a group, else those of edges that may not have heard of the general ones.
         The newest six count; an edge may know no others than those before."""
@@ -135,12 +133,8 @@ class GroundLink:
         group.forget(except_for=known | self._leaving)
 
     def _begin(self, edge: str) -> None:
-        port = self._port(edge, alive=True)
-        if port is None:
-            return
-        if edge in self._alive:
-            port.present.set()
-        self._subscribe(edge, 0)
+        if self._port(edge) is not None:
+            self._subscribe(edge, 0)
 
     def _subscribe(self, edge: str, number: int) -> None:
         # Make new ones first, and keep the last ones: declarations of the new may be lost on the way, while the
@@ -164,7 +158,7 @@ class GroundLink:
         parsed = self._parsed(item.key)
         if parsed is None or number != (self._again[parsed[0]] if parsed[0] in self._subscribers else -1):
             return
-        port = self._port(parsed[0])
+        port = self._ports.get(parsed[0]) if self._group else self._port(parsed[0], sends=True)
         if port is not None:
             port.put(item, parsed[1])
 
@@ -205,29 +199,27 @@ class GroundLink:
             return None
         return parsed
 
-    def _port(self, edge: str, *, alive: bool = False) -> EdgePort | None:
+    def _port(self, edge: str, *, sends: bool = False) -> EdgePort | None:
         with self._lock:
             port = self._ports.get(edge)
             if port is None:
-                waits = edge in self._unplaced
-                if len(self._ports) >= MAX_EDGES and not ((alive or waits) and self._make_space()):
+                alive = edge in self._alive
+                if len(self._ports) >= MAX_EDGES and not (alive and self._make_space(silent=sends)):
                     self.foreign += 1
-                    if alive and len(self._unplaced) < MAX_EDGES:
-                        self._unplaced.add(edge)
                     self._say_refused(edge)
                     return None
                 port = self._ports[edge] = EdgePort(
                     self._session, edge, clock=self._clock, log=self._log, still_codecs=self._still_codecs
                 )
-                if waits:  # its token came once, and does not come again
-                    self._unplaced.discard(edge)
+                if alive:  # its token came once, and does not come again
                     port.present.set()
             return port
 
-    def _make_space(self) -> bool:
-        # Leave one that is not there and has no session: a ground may run for years.
+    def _make_space(self, *, silent: bool) -> bool:
+        # Leave one that is not there and has no session: a ground may run for years. Or a ``silent`` one.
         for edge, port in self._ports.items():
-            if not port.present.is_set() and not port.used.is_set():
+            gone = not port.present.is_set() and not port.used.is_set()
+            if gone or (silent and not port.has_sent):
                 del self._ports[edge]
                 if self._group is not None and edge in self._subscribers:
                     self._leaving.add(edge)
@@ -250,26 +242,20 @@ class GroundLink:
         parsed = self._parsed(key)
         if parsed is None:
             return
+        edge = parsed[0]
         try:
-            port = self._port_of_token(parsed[0], there=there)
+            with self._lock:
+                if not there:
+                    self._alive.discard(edge)
+                elif len(self._alive) < _MOST_ALIVE:
+                    self._alive.add(edge)
+            # In a group it may be another's: there is a port for it only if it is served here.
+            port = self._port(edge) if there and self._group is None else self._ports.get(edge)
         except Exception as error:  # noqa: BLE001 - for the edge's thread
             self._fail(key, error)
             return
         if port is not None:
             (port.present.set if there else port.present.clear)()
-
-    def _port_of_token(self, edge: str, *, there: bool) -> EdgePort | None:
-        if self._group is None:
-            if not there:
-                self._unplaced.discard(edge)
-            return self._port(edge, alive=there)
-        # It may be another's: there is a port for it only if it is served here.
-        with self._lock:
-            if not there:
-                self._alive.discard(edge)
-            elif len(self._alive) < _MOST_SHARED:
-                self._alive.add(edge)
-            return self._ports.get(edge)
 
     def _fail(self, key: str, error: Exception) -> None:
         # Hand over the error of a callback: to the edge's thread, which ends its session for it.

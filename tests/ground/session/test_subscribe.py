@@ -91,6 +91,25 @@ def test_invented_names_do_not_lock_out_a_real_edge(link, caplog):
         assert ground.is_known("uav-1")
 
 
+def test_tokens_alone_do_not_keep_out_an_edge_that_sends(link):
+    """Somebody shows a thousand tokens, and the drone that starts afterwards is never shown."""
+    ground, outsider = link
+    count = 2 * MAX_EDGES + 2
+    tokens = [outsider.liveliness().declare_token(f"hvt/ghost-{number}/alive") for number in range(count)]
+    with outsider.liveliness().declare_token("hvt/uav-1/alive"):
+        eventually(lambda: ground.is_known("uav-1"), what="its token has come")
+        assert "uav-1" not in served(ground)
+        outsider.put("hvt/uav-1/status", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        eventually(lambda: "uav-1" in served(ground), what="it is served")
+        (port,) = [port for port in ground.ports() if port.edge == "uav-1"]
+        assert port.present.is_set()
+        assert port.inbox.get(timeout_s=0.1) is not None
+        outsider.put("hvt/ghost-0/status", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        assert len(served(ground)) == MAX_EDGES
+    for token in tokens:
+        token.undeclare()
+
+
 def test_edges_that_are_there_or_fly_keep_their_place(link):
     """A stranger's token would end a flight."""
     ground, outsider = link
