@@ -97,9 +97,8 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     if not (listen or connect or file_listen or _endpoints(said, "connect")):
         listen = (DEFAULT_ENDPOINT,) if settings.role == "ground" else ()
         connect = () if settings.role == "ground" else (DEFAULT_ENDPOINT,)
-    for side, endpoints in (("listen", listen), ("connect", connect)):
-        for endpoint in endpoints:
-            _check_endpoint(endpoint, side)
+    _check_endpoints("listen", listen)
+    _check_endpoints("connect", connect)
     if listen or not file_listen:
         # Never Zenoh's own default: a peer that listens on every address.
         _insert_endpoints(config, "listen", listen)
@@ -218,13 +217,14 @@ _IFACE = re.compile(r"(\[fe[89ab][^%\]]*)(\][^#]*)#(?:.*;)?iface=([^;]+).*", re.
 """Of ``[fe80::1%eth0]`` Zenoh knows numbers alone, which change with the interface; here it knows names."""
 
 
-def _check_endpoint(endpoint: str, side: str) -> None:
-    found = _ENDPOINT.fullmatch(endpoint)
-    if found is None or not 1 <= int(found["port"]) <= 65535:
-        raise UserError(
-            f"--{side} {endpoint!r} is not usable: PROTOCOL/HOST:PORT is accepted, such as {DEFAULT_ENDPOINT}, "
-            "with tcp, tls, udp, quic or ws and a port of 1 to 65535"
-        )
+def _check_endpoints(side: str, endpoints: tuple[str, ...]) -> None:
+    for endpoint in endpoints:
+        found = _ENDPOINT.fullmatch(endpoint)
+        if found is None or not 1 <= int(found["port"]) <= 65535:
+            raise UserError(
+                f"--{side} {endpoint!r} is not usable: PROTOCOL/HOST:PORT is accepted, such as {DEFAULT_ENDPOINT}, "
+                "with tcp, tls, udp, quic or ws and a port of 1 to 65535"
+            )
 
 
 def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) -> None:

@@ -129,11 +129,9 @@ class ZenohLink:
     ) -> None:
         """Send one message; blocks while the link is full. A link that is gone drops it without an error."""
         with suppress(zenoh.ZError):
-            # A report goes about once a second, and a ground that gets none subscribes again.
+            # A report goes about once a second.
             if channel is Channel.STATUS and self._listener is not None and self._loses():
                 self._listener.declare_again(there=self.has_ground())
-                if not self.has_subscriber(Channel.BASE):
-                    return
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
 
     def listen(self, answers: Answers) -> None:

@@ -24,6 +24,7 @@ from hvt_common.protocol.messages import (
     UnknownVersionError,
     WireError,
 )
+from hvt_common.runtime.failures import RetryPause
 from hvt_common.transport.inbox import FloodWatch, Inbox, Received, TokenBucket
 from hvt_common.transport.link_doctor import control_unanswered
 from hvt_common.transport.session import declare_publisher, query_later
@@ -72,8 +73,10 @@ class EdgePort:
         """Set while the edge's liveliness token is there."""
         self.used = threading.Event()
         """Set while there is more to this edge than messages under its name: a session that is open."""
-        self.has_sent = False
-        """Any message at all: a token alone costs its maker nothing."""
+        self.used_channels = set[Channel]()
+        """Those on which something has come; `GroundLink` may forget them while no reports come."""
+        self.resubscription: RetryPause | None = None
+        """Until its silent channels are subscribed to again (`GroundLink`)."""
         self.reported_ns = 0
         """When its newest report came; 0 before the first."""
         self._unanswered = self._unusable = 0
@@ -142,7 +145,7 @@ class EdgePort:
 
     def put(self, item: Received, row: Channel) -> None:
         """Take a message in, or drop it: without room, or where an edge reports without end."""
-        self.has_sent = True
+        self.used_channels.add(row)
         if row == Channel.STATUS:
             self.reported_ns = item.received_ns
             if not self._reports.take(item.received_ns):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Self
@@ -29,7 +28,8 @@ token takes the place of one that has neither a token nor a session; one that se
 _MOST_ALIVE = 16384
 """Tokens that are remembered, of edges of all members of a group together."""
 _QUIET_NS, _MOST_QUIET_NS = 2 * SECOND_NS, 64 * SECOND_NS
-"""The time that a present edge may send nothing; the longest pause before its subscriptions are made again."""
+"""A present edge reports within this time; the longest pause before a channel on which nothing comes is subscribed to
+again."""
 _SUBSCRIBED = (
     *(Channel.BASE, Channel.ROI, Channel.TRACKS),
     *(Channel.POSE, Channel.BACKLOG, Channel.STATUS),
@@ -62,13 +62,11 @@ class GroundLink:
         self._log = log
         self._alive: set[str] = set()
         """Edges that show their token, also those that others serve, or that found no place."""
-        self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
-        """Subscriptions by edge: all with a group, else those of edges that may not have heard of the general ones.
-        The newest six count; an edge may know no others than those before."""
-        self._quiet: dict[str, RetryPause] = {}
-        """By edge that is there, until its subscriptions are made again."""
-        self._again = Counter[str]()
-        """How often that was."""
+        self._subscribers: dict[str, dict[Channel, list[zenoh.Subscriber[None]]]] = {}
+        """Subscriptions by edge: all with a group, else those of channels that it may not know by the general ones.
+        The newest counts; an edge may know no other than the one before."""
+        self._newest: dict[tuple[str, Channel], int] = {}
+        """The number of the newest."""
         self._leaving: set[str] = set()
         """Edges whose last session here is being closed; with a group."""
         self._clock = clock or SteadyClock()
@@ -134,19 +132,18 @@ class GroundLink:
 
     def _begin(self, edge: str) -> None:
         if self._port(edge) is not None:
-            self._subscribe(edge, 0)
+            for row in _SUBSCRIBED:
+                self._subscribe(edge, row, 0)
 
-    def _subscribe(self, edge: str, number: int) -> None:
-        # Make new ones first, and keep the last ones: declarations of the new may be lost on the way, while the
+    def _subscribe(self, edge: str, row: Channel, number: int) -> None:
+        # Make the new one first, and keep the last one: the declaration of the new may be lost on the way, while the
         # withdrawal of the old arrives.
-        former, keys = self._subscribers.get(edge, []), EdgeKeys(edge)
-        new = [
-            self._declare(another_key(keys.key(row), row, number=number), number=number)
-            for row in _SUBSCRIBED
-        ]
-        self._again[edge] = number
-        self._subscribers[edge] = new + former[: len(new)]
-        for one in former[len(new) :]:
+        own = self._subscribers.setdefault(edge, {})
+        new = self._declare(another_key(EdgeKeys(edge).key(row), row, number=number), number=number)
+        self._newest[edge, row] = number
+        former = own.get(row, [])
+        own[row] = [new, *former[:1]]
+        for one in former[1:]:
             one.undeclare()  # type: ignore[no-untyped-call]
 
     def _declare(self, key_expr: str, *, number: int) -> zenoh.Subscriber[None]:
@@ -154,27 +151,29 @@ class GroundLink:
         return subscribe(self._session, key_expr, put=put, clock=self._clock, on_error=self._fail)
 
     def _put(self, item: Received, *, number: int) -> None:
-        # Takes messages of an edge's newest subscriptions, or of those of all edges (-1) where it has none.
+        # Takes messages of a channel's newest subscription, or of that of all edges (-1) where it has none.
         parsed = self._parsed(item.key)
-        if parsed is None or number != (self._again[parsed[0]] if parsed[0] in self._subscribers else -1):
+        if parsed is None or number != self._newest.get(parsed, -1):
             return
         port = self._ports.get(parsed[0]) if self._group else self._port(parsed[0], sends=True)
         if port is not None:
             port.put(item, parsed[1])
 
     def _subscribe_again(self, port: EdgePort) -> None:
-        # Twice in any case: those of one channel may be lost alone. Then while no report comes from an edge that is
-        # there, as each second if it knows who listens to it and its video. Zenoh withdraws the token of another.
+        # Channels on which nothing has come since reports came: the subscription of each may be lost alone. A new one
+        # of a channel that works could lose it. Zenoh withdraws the token of another way.
         now_ns, edge, there = self._clock(), port.edge, port.present.is_set()
-        if port.reported_ns and not there:
-            self._quiet.pop(edge, None)
-            return
-        pause = self._quiet.setdefault(edge, RetryPause(_QUIET_NS, _MOST_QUIET_NS))
         silent = now_ns - port.reported_ns >= _QUIET_NS
-        tries = silent and (there or pause.pause_ns < _MOST_QUIET_NS)
-        if pause.due(now_ns) and (tries or pause.pause_ns <= 2 * _QUIET_NS):
-            if pause.pause_ns:
-                self._subscribe(edge, self._again[edge] + 1)
+        if Channel.STATUS in port.used_channels and (silent or not there):
+            port.used_channels.clear()
+            port.resubscription = None
+        if port.reported_ns and not there:
+            return
+        port.resubscription = pause = port.resubscription or RetryPause(_QUIET_NS, _MOST_QUIET_NS)
+        if pause.due(now_ns) and (there or pause.pause_ns < _MOST_QUIET_NS):
+            for row in _SUBSCRIBED if pause.pause_ns else ():
+                if row not in port.used_channels:
+                    self._subscribe(edge, row, max(0, self._newest.get((edge, row), -1)) + 1)
             pause.failed(now_ns)
 
     def _leave(self, edge: str) -> None:
@@ -187,10 +186,10 @@ class GroundLink:
 
     def _unsubscribe(self, edge: str) -> None:
         # Not while the lock is held: Zenoh may wait for a callback that wants it.
-        for memory in (self._again, self._quiet):
-            memory.pop(edge, None)
-        for one in self._subscribers.pop(edge):
-            one.undeclare()  # type: ignore[no-untyped-call]
+        for row, subscribers in self._subscribers.pop(edge).items():
+            del self._newest[edge, row]
+            for one in subscribers:
+                one.undeclare()  # type: ignore[no-untyped-call]
 
     def _parsed(self, key: str) -> tuple[str, Channel] | None:
         parsed = parse_key(key)
@@ -218,8 +217,8 @@ class GroundLink:
     def _make_space(self, *, silent: bool) -> bool:
         # Leave one that is not there and has no session: a ground may run for years. Or a ``silent`` one.
         for edge, port in self._ports.items():
-            gone = not port.present.is_set() and not port.used.is_set()
-            if gone or (silent and not port.has_sent):
+            waits = not port.present.is_set() or (silent and not port.used_channels)
+            if waits and not port.used.is_set():
                 del self._ports[edge]
                 if self._group is not None and edge in self._subscribers:
                     self._leaving.add(edge)
