@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import ipaddress
-import logging
 import os
 import re
 import socket
@@ -20,13 +19,13 @@ from typing import Any, ClassVar, Self
 
 import zenoh
 
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.zenoh_config import connect_endpoints
-
-_log = logging.getLogger(__name__)
 
 TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 
+LISTENER = "listener"
 _EVERY_S = 0.25
 _UNREAD_EVERY_S, _UNREAD_CHECKS = 1.0, 5
 _HANGS_S = 0.5
@@ -107,8 +106,8 @@ class StaleSockets:
     one has its full time, should the other side be slow. Of a name with several addresses the first, where
     it is dark, would take all of ``open_timeout`` each time: it is shut down as soon as another one answers.
 
-    A UDP listener that is not read any more is said: Zenoh's stands still for ever where two datagrams wait from a
-    link that ended while the program was stopped.
+    A UDP listener that is not read any more has failed, and ``failures`` says so: Zenoh's stands still for ever where
+    two datagrams wait from a link that ended while the program was stopped.
 
     Other sockets of the process are none of its business, even where they are connected to the same place: Zenoh's
     have the send buffer that its configuration says. A link of any session here is no handshake.
@@ -117,8 +116,9 @@ class StaleSockets:
     _sessions: ClassVar[list[zenoh.Session]] = []
     """All that are watched in this process."""
 
-    def __init__(self, session: zenoh.Session, config: zenoh.Config) -> None:
+    def __init__(self, session: zenoh.Session, config: zenoh.Config, failures: Failures) -> None:
         self._session = session
+        self._failures = failures
         self._open_s = int(config.get_json("transport/unicast/open_timeout")) / 1000
         self._tables = [one for one in TCP_TABLES if one.exists()]
         self._places = {end_of(one) for one in connect_endpoints(config)}
@@ -141,6 +141,7 @@ class StaleSockets:
         self._unread: dict[str, tuple[int, int]] = {}
         """Bytes that wait at a UDP listener, and for how many checks they have not become fewer."""
         self._next_unread_s = 0.0
+        self._deaf = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-sockets", daemon=True)
 
@@ -200,20 +201,20 @@ class StaleSockets:
             _shut_down(own[inode], inode)
 
     def check_unread(self) -> None:
-        """Say once of a UDP listener that it is not read; call it about once a second."""
+        """Say of a UDP listener that it is not read; call it about once a second."""
         before, self._unread = self._unread, {}
         for end, _, size in _own(UDP_TABLES):
             port = end.rpartition(":")[2]
             if size and port in self._datagram_ports:
                 least, checks = before.get(end, (0, 0))
                 self._unread[end] = (size, checks + 1 if size >= least else 1)
-                if self._unread[end][1] > _UNREAD_CHECKS:
-                    self._datagram_ports.discard(port)
-                    _log.error(
-                        "what comes to udp %s is not read any more, as may happen to a program that was stopped for "
-                        "some seconds: restart it",
-                        end,
-                    )
+        deaf = [end for end, (_, checks) in self._unread.items() if checks > _UNREAD_CHECKS]
+        if deaf and not self._deaf:
+            why = "is not read any more, as may happen to a program that was stopped for some seconds: restart it"
+            self._failures.failed(LISTENER, f"what comes to udp {', '.join(deaf)} {why}", last=True)
+        elif self._deaf and not deaf:
+            self._failures.works(LISTENER)
+        self._deaf = bool(deaf)
 
     def _zenohs(self) -> dict[int, int]:
         # Inode → descriptor. Each socket is looked at once: a host program may have thousands.

@@ -17,6 +17,7 @@ from pathlib import Path
 import json5
 import pytest
 
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.session import open_session
 from hvt_common.transport.stale_sockets import TCP_TABLES, StaleSockets, end_of, same_socket
 from hvt_common.transport.zenoh_config import LinkSettings, configure
@@ -54,20 +55,26 @@ def test_an_end_has_one_spelling() -> None:
     assert {locator: end_of(locator) for locator in ends} == ends
 
 
-def test_a_udp_listener_that_nobody_reads_is_said(caplog: pytest.LogCaptureFixture) -> None:
-    """A ground that was stopped for some seconds would say for ever that the link is lost."""
+def test_a_udp_listener_that_nobody_reads_has_failed() -> None:
+    """A ground that was stopped for some seconds would say for ever that the link is lost, and all else is well."""
+    failures = Failures(time.time_ns)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))
         host, port = deaf.getsockname()
         config, _ = configure(LinkSettings("ground", listen=(f"udp/{host}:{port}",)))
-        watch = StaleSockets(None, config)  # type: ignore[arg-type]
+        watch = StaleSockets(None, config, failures)  # type: ignore[arg-type]
         for check in range(12):
             for _ in range(2 * (check == 3)):  # somebody reads
                 deaf.recv(9)
             deaf.sendto(b"one", (host, port))
             watch.check_unread()
-            assert len(caplog.messages) == (check >= 8)
-    assert f"{host}:{port}" in caplog.messages[0]
+            assert len(failures.now) == (check >= 8)
+        (failed,) = failures.now
+        assert f"udp {host}:{port} is not read" in failed.reason
+        while failures.now:
+            deaf.recv(9)
+            watch.check_unread()
+        assert failures.parts[0].count == 1
 
 
 def test_no_socket_of_zenoh_lingers(free_port: int) -> None:
