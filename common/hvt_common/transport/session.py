@@ -23,7 +23,7 @@ from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, 
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.link_doctor import link_doctor
-from hvt_common.transport.stale_sockets import LISTENER, StaleSockets, end_of, ends_of, listening_ends
+from hvt_common.transport.stale_sockets import StaleSockets, end_of, ends_of, listening_ends
 from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
 
 _log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ def _open_listening_later(
             raise NotYetError(why)
         return True
 
-    part = Awaited(bound, LISTENER, failures, longest_s=1.0)
+    part = Awaited(bound, "listener", failures, longest_s=1.0)
     threading.Thread(target=part.wait, args=[stop], name="hvt-listen", daemon=True).start()
     return session
 

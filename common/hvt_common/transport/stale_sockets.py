@@ -25,7 +25,7 @@ from hvt_common.transport.zenoh_config import connect_endpoints
 TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 
-LISTENER = "listener"
+_LISTENER = "listener"
 _EVERY_S = 0.25
 _UNREAD_EVERY_S, _UNREAD_CHECKS = 1.0, 5
 _HANGS_S = 0.5
@@ -211,9 +211,9 @@ class StaleSockets:
         deaf = [end for end, (_, checks) in self._unread.items() if checks > _UNREAD_CHECKS]
         if deaf and not self._deaf:
             why = "is not read any more, as may happen to a program that was stopped for some seconds: restart it"
-            self._failures.failed(LISTENER, f"what comes to udp {', '.join(deaf)} {why}", last=True)
+            self._failures.failed(_LISTENER, f"what comes to udp {', '.join(deaf)} {why}", last=True)
         elif self._deaf and not deaf:
-            self._failures.works(LISTENER)
+            self._failures.works(_LISTENER)
         self._deaf = bool(deaf)
 
     def _zenohs(self) -> dict[int, int]:

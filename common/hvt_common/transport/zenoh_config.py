@@ -139,28 +139,23 @@ def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
 
     if path is None:
         return zenoh.Config(), {}
+    what = f"--zenoh-config {path}"
     try:
         text = read_text(path)
     except OSError as error:
-        raise absent(path)(
-            f"--zenoh-config {path} cannot be read ({error.strerror}): give a JSON5 file"
-        ) from None
+        raise absent(path)(f"{what} cannot be read ({error.strerror}): give a JSON5 file") from None
     try:
         said = json5.loads(text)
     except (ValueError, RecursionError) as error:
         line, reason = _located(str(error))
-        raise UserError(f"--zenoh-config {path}{line} is not JSON5: {reason}") from None
+        raise UserError(f"{what}{line} is not JSON5: {reason}") from None
     if not isinstance(said, dict):
-        raise UserError(
-            f"--zenoh-config {path} is a {type(said).__name__}: give Zenoh's settings, an object in braces"
-        )
+        raise UserError(f"{what} is a {type(said).__name__}: give Zenoh's settings, an object in braces")
     try:
         return zenoh.Config.from_json5(text), said
     except zenoh.ZError as error:
         reason = without_build_paths(str(error))
-        raise UserError(
-            f"--zenoh-config {path}{_line_of(reason, text)} is not accepted by Zenoh: {reason}"
-        ) from None
+        raise UserError(f"{what}{_line_of(reason, text)} is not accepted by Zenoh: {reason}") from None
 
 
 def _mentions(said: dict[str, Any], path: str) -> bool:

@@ -21,7 +21,6 @@ from hvt_common.protocol.messages import (
     Feedback,
     Info,
     InfoRequest,
-    UnknownVersionError,
     WireError,
 )
 from hvt_common.runtime.failures import RetryPause
@@ -80,7 +79,6 @@ class EdgePort:
         self.reported_ns = 0
         """When its newest report came; 0 before the first."""
         self._unanswered = self._unusable = 0
-        self._version_said = False
         self._keys = EdgeKeys(self.edge)
         self._feedback: zenoh.Publisher | None = None
         self._sending = threading.Lock()
@@ -114,11 +112,6 @@ class EdgePort:
                 self.log(Received(self._keys.key(Channel.INFO), data, b"", "", answered_ns))
             try:
                 info = Info.parse(data)
-            except UnknownVersionError as error:
-                if not self._version_said:  # once: it is asked again and again
-                    self._version_said = True
-                    _log.warning("%s", error.between(f"edge {self.edge}", "this ground"))
-                return
             except WireError as error:
                 self._unusable += 1
                 if self._unusable.bit_count() == 1:  # 1, 2, 4, 8 …: anybody may answer, as often as he likes

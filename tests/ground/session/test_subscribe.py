@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
-import msgpack
 import pytest
 import zenoh
 
@@ -131,40 +129,6 @@ def test_edges_that_are_there_or_fly_keep_their_place(link):
         assert late.present.is_set()
     for token in tokens:
         token.undeclare()
-
-
-@pytest.mark.parametrize(
-    ("version", "said"),
-    [
-        (6, "edge uav-1 speaks wire version 6, this ground reads 5: update this ground"),
-        (4, "edge uav-1 speaks wire version 4, this ground reads 5: update edge uav-1"),
-    ],
-)
-def test_another_version_of_the_wire_is_said_once(link, caplog, version, said):
-    """The operator would see no picture, or an edge that obeys nothing, and no reason."""
-    ground, outsider = link
-    values = [version, version, *msgpack.unpackb(INFO.pack())[3:-1]]
-    body = msgpack.packb([version, *values, 2**32 - 1])[:-5]
-    answer = body + b"\xce" + zlib.crc32(body).to_bytes(4, "big")
-    keys = EdgeKeys("uav-1")
-    queryable = serve(outsider, Channel.INFO, keys=keys, answer=lambda _question: answer)
-    with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
-        eventually(lambda: served(ground) == {"uav-1"}, what="it is served")
-        (port,) = ground.ports()
-        answers: list[object] = []
-
-        def answered_twice() -> bool:
-            """A busy machine answers too late now and then."""
-            answers.append(port.query_info(7))
-            return len(answers) >= 2 and bool(warnings())
-
-        def warnings() -> list[str]:
-            return [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
-
-        eventually(answered_twice, what="it has answered")
-        queryable.undeclare()
-    assert not any(answers)
-    assert warnings() == [said]
 
 
 def test_answers_that_are_none_do_not_fill_the_log(monkeypatch, caplog):
