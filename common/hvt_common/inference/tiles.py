@@ -211,8 +211,8 @@ def with_large(whole: Detections, image_bgr: Image, detect: Callable[[Image], De
     found = replace(found, boxes_xyxy_px=found.boxes_xyxy_px / np.float32(scale))
     large = found.take(np.flatnonzero(are_large(found.boxes_xyxy_px, image_bgr)))
     sure = large.boxes_xyxy_px[large.confidences >= _SURE]
-    tiny = _areas(whole.boxes_xyxy_px)[:, None] < _PART * _areas(sure)[None]
-    part = np.any(tiny & (_shared_of_smaller(whole.boxes_xyxy_px, sure) > _INSIDE), axis=1)
+    tiny = areas(whole.boxes_xyxy_px)[:, None] < _PART * areas(sure)[None]
+    part = np.any(tiny & (shared_of_smaller(whole.boxes_xyxy_px, sure) > _INSIDE), axis=1)
     parts = [whole.take(np.flatnonzero(~part)), large]
     return _merged(parts, np.zeros(sum(map(len, parts)), bool))
 
@@ -260,15 +260,15 @@ def _merged(parts: list[Detections], truncated: npt.NDArray[np.bool_]) -> Detect
 
 def _outermost(boxes: Boxes, class_ids: npt.NDArray[np.int32]) -> npt.NDArray[np.intp]:
     # Of boxes, best first, those that do not lie in a better one of their class, nor hold one.
-    inside = _shared_of_smaller(boxes, boxes) > _INSIDE
+    inside = shared_of_smaller(boxes, boxes) > _INSIDE
     inside &= class_ids[:, None] == class_ids[None, :]
     return _first_come(inside)
 
 
 def _uncovered(partial: Boxes, others: Boxes) -> npt.NDArray[np.intp]:
     # Of truncated boxes, best first, those that neither the others nor a better one cover by half.
-    free = np.flatnonzero(~(_shared_of_smaller(partial, others) > _COVERED).any(axis=1))
-    return free[_first_come(_shared_of_smaller(partial[free], partial[free]) > _COVERED)]
+    free = np.flatnonzero(~(shared_of_smaller(partial, others) > _COVERED).any(axis=1))
+    return free[_first_come(shared_of_smaller(partial[free], partial[free]) > _COVERED)]
 
 
 def _joined(partial: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, npt.NDArray[np.intp]]:
@@ -297,15 +297,16 @@ def _first_come(same: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
     return np.flatnonzero(left)
 
 
-def _shared_of_smaller(a_xyxy: Boxes, b_xyxy: Boxes) -> npt.NDArray[np.float32]:
-    # (N, M) intersection over the smaller of two boxes.
+def shared_of_smaller(a_xyxy: Boxes, b_xyxy: Boxes) -> npt.NDArray[np.float32]:
+    """(N, M) intersection over the smaller of two boxes."""
     a, b = a_xyxy[:, None, :], b_xyxy[None, :, :]
     shared = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(
         -1
     )
-    smaller = np.minimum(_areas(a), _areas(b))
+    smaller = np.minimum(areas(a), areas(b))
     return np.asarray(shared / np.maximum(smaller, 1e-6), np.float32)
 
 
-def _areas(boxes: Boxes) -> npt.NDArray[np.float32]:
+def areas(boxes: Boxes) -> npt.NDArray[np.float32]:
+    """(…) of boxes (…, 4)."""
     return np.asarray((boxes[..., 2:] - boxes[..., :2]).prod(-1))

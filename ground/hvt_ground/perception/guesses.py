@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from hvt_common.camera_motion import Affine
 from hvt_common.inference.class_names import group_of
+from hvt_common.inference.tiles import shared_of_smaller
 from hvt_common.values import Boxes, Tracks
 from hvt_ground.events import Refinement
 from hvt_ground.perception.stills.posterior import LEAST_SURE_PX, SURE
@@ -95,7 +96,7 @@ class Guesses:
                 one.totals[names[row]] = one.totals.get(names[row], 0.0) + float(scores[row])
                 one.count += 1
             self._seen[track_id] = one
-        self._ids = self._guessed(tracks.ids.tolist(), names, boxes)
+        self._ids = self._guessed(tracks.ids.tolist(), names, tracks.boxes_xyxy_px)
 
     def among(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """(N,) True for those that were guesses in the newest list."""
@@ -118,7 +119,7 @@ class Guesses:
         ]
         return np.array(means) >= [_AGREED.get(name, otherwise) for name in names]
 
-    def _guessed(self, ids: Sequence[int], names: Sequence[str], boxes: _Floats) -> frozenset[int]:
+    def _guessed(self, ids: Sequence[int], names: Sequence[str], boxes: Boxes) -> frozenset[int]:
         sides = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0)
         groups = np.array([group_of(name) or name for name in names], object)
         means = np.array([self._seen[one].mean() for one in ids])
@@ -128,7 +129,7 @@ class Guesses:
             like = sides[(means >= likely) & (groups == groups[row])]
             larger = sides[row] / np.median(like) if len(like) >= _NEIGHBOURS else np.nan
             surer = boxes[(means > means[row]) & (groups == groups[row])]
-            on = _is_on(boxes[row], surer)
+            on = bool((shared_of_smaller(boxes[row, None], surer) > _ON).any())
             odd = larger >= _LARGER or on
             usual = groups[row] != "person" and not odd and larger > 1 / _LARGER
             weak = means[row] < (_LIKELY_ODD if odd else likely[row])
@@ -148,9 +149,3 @@ def are_firm(
     boxes = np.asarray(boxes_base_px)
     sides = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf)
     return np.asarray((np.asarray(confidences) > SURE) & (sides >= LEAST_SURE_PX * scale))
-
-
-def _is_on(box: _Floats, others: _Floats) -> bool:
-    inner = (np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])).clip(0).prod(1)
-    smaller = np.minimum((box[2:] - box[:2]).prod(), (others[:, 2:] - others[:, :2]).prod(1))
-    return bool((inner > _ON * smaller).any())

@@ -10,16 +10,16 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.inference.tiles import areas
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Boxes, Detections, Image, Tracks, View
+from hvt_common.values import Detections, Image, Tracks, View
 from hvt_common.video.hevc import Picture, YuvPicture
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.fusion.entity import CameraPath
@@ -442,7 +442,7 @@ class Pipeline:
     def _inside(self, shown: Overlay) -> Overlay:
         # The tracker lets boxes leave the picture.
         boxes = np.clip(shown.boxes_base_px, 0, np.array([*self._base_size, *self._base_size], np.float32))
-        rows = np.flatnonzero(_areas(boxes) > _LEAST_INSIDE * _areas(shown.boxes_base_px))
+        rows = np.flatnonzero(areas(boxes) > _LEAST_INSIDE * areas(shown.boxes_base_px))
         return replace(shown, boxes_base_px=boxes).take(rows)
 
     def _carry_merges(self) -> None:
@@ -454,8 +454,3 @@ class Pipeline:
 def _gray(picture: Picture) -> Image:
     # Gray is enough to follow the camera. Only searched pictures are converted to BGR.
     return picture.gray() if isinstance(picture, YuvPicture) else picture
-
-
-def _areas(boxes: Boxes) -> npt.NDArray[np.float32]:
-    wide, high = (boxes[:, 2:] - boxes[:, :2]).T
-    return np.asarray(wide * high)
