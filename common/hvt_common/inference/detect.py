@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,29 +48,17 @@ _OURS = "hvt.training_commit"
 _ENLARGE_TO = "hvt.enlarge_to"
 _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
+_THERMAL_SHARE, _THERMAL_RAISED = 0.75, 0.3
+"""A small picture without colour is enlarged to this share of that side: twice as large, 640x512 shows a third fewer
+people. The second network of a file is silent there and cannot agree (`averaged`): scores rise by this, of the logit.
+"""
+_LEAST_COLOUR = 0.5
+"""The mean of |B - G| and |G - R| in a picture with colour, as `hvt_train.join` has it."""
 _BROKEN = 0.1
 """Where no more of an answer is no number, that is some cells; the scores of one class are a fifth."""
 _TWIN_IOU = 0.8
 """Two boxes that overlap more are one object, whatever their classes: networks call one vehicle a car and a van. A
 rider and the bicycle below overlap less."""
-
-
-class Detector(Protocol):
-    """Finds objects in one image after the other, of any sizes. One thread at a time calls it.
-
-    This is also the contract of a plug-in (``hvt.detectors``, docs/models.md): its answer depends on the image alone,
-    and it may raise; then the flight goes on without detections, and it is opened again after a pause.
-    """
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """The names that ``class_ids`` index."""
-
-    def detect(self, image_bgr: Image) -> Detections:
-        """Detections in (height, width, 3) uint8, which must not be written to: in its pixels, inside it, best first.
-
-        One box an object (after NMS). A plug-in may give them all: those below the confidence of use are left out.
-        """
 
 
 class FailingDetector(Protocol):
@@ -81,6 +70,20 @@ class FailingDetector(Protocol):
 
     def detect(self, image_bgr: Image) -> Detections | None:
         """As `Detector.detect`; None while it does not work."""
+
+
+class Detector(FailingDetector, Protocol):
+    """Finds objects in one image after the other, of any sizes. One thread at a time calls it.
+
+    This is also the contract of a plug-in (``hvt.detectors``, docs/models.md): its answer depends on the image alone,
+    and it may raise; then the flight goes on without detections, and it is opened again after a pause.
+    """
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """Detections in (height, width, 3) uint8, which must not be written to: in its pixels, inside it, best first.
+
+        One box an object (after NMS). A plug-in may give them all: those below the confidence of use are left out.
+        """
 
 
 def open_detector(
@@ -163,7 +166,7 @@ def warm_up(detector: FailingDetector, size: tuple[int, int]) -> None:
     """
     motion = library_part(MOTION)
     if motion is None or not isinstance(detector, motion):
-        detector.detect(np.zeros((size[1], size[0], 3), np.uint8))
+        detector.detect(np.full((size[1], size[0], 3), (9, 0, 0), np.uint8))
 
 
 class OnnxDetector:
@@ -239,7 +242,9 @@ class OnnxDetector:
         Raises `UserError` where it does not run, or no number comes out: that is no picture without objects.
         """
         image = as_bgr(image_bgr)
-        input_size = self.input_size((image.shape[1], image.shape[0]), share=share)
+        step = np.diff(image[::8, ::8].astype(np.int16), axis=2)
+        thermal = max(image.shape) < self._enlarge_to and float(np.abs(step).mean()) <= _LEAST_COLOUR
+        input_size = self.input_size((image.shape[1], image.shape[0]), share=share, thermal=thermal)
         tensor, letterbox = self._letterboxer.fill(image, input_size)
         least = min(self._confidence, WEAK) if self._averages else self._confidence
         outputs = self._run(tensor)
@@ -264,6 +269,8 @@ class OnnxDetector:
         boxes, scores = found.boxes_input_px[selected], found.scores[selected]
         if self.head.suppresses and self._averages:
             boxes, scores = averaged(*candidates, selected, iou=self._nms_iou, second=found.second)
+            if thermal and found.second is not None:
+                scores = np.asarray(scores / (scores + (1 - scores) * math.exp(-_THERMAL_RAISED)), np.float32)
             best = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores >= self._confidence)]
             boxes, scores, selected = boxes[best], scores[best], selected[best]
         boxes = letterbox.to_image(boxes)
@@ -285,7 +292,9 @@ class OnnxDetector:
         inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & named
         return Detections(boxes[inside], scores[inside], class_ids[inside])
 
-    def input_size(self, image_size: tuple[int, int], *, share: float = 1.0) -> tuple[int, int]:
+    def input_size(
+        self, image_size: tuple[int, int], *, share: float = 1.0, thermal: bool = False
+    ) -> tuple[int, int]:
         """(width, height) in pixels that the network gets for an image of this (width, height).
 
         A network that was trained for small objects may want small images enlarged (``hvt.enlarge_to`` in its
@@ -295,7 +304,7 @@ class OnnxDetector:
         if self._fixed_size is not None:
             return self._fixed_size
         longest = max(image_size)
-        wanted = self._enlarge_to or self._trained_at
+        wanted = self._enlarge_to * (_THERMAL_SHARE if thermal else 1) or self._trained_at
         scale = min(wanted / longest, _MOST_ENLARGED) if wanted else 1.0
         if not self._trained_at or self._enlarge_to:
             scale = max(1.0, scale)

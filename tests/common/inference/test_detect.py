@@ -311,18 +311,23 @@ def test_a_box_of_our_networks_is_the_mean_of_what_several_cells_say(tmp_path: P
 
 
 def test_what_both_networks_of_a_file_see_is_surer(tmp_path: Path) -> None:
-    """A car aslant that each of them half believes in would not be shown; two cells of one network are no witness."""
+    """A car aslant that each of them half believes in would not be shown; two cells of one network are no witness.
+
+    Nor would half of the people of a thermal camera: there the second network is silent.
+    """
     strides = (8, 16, 32, 16, 32, 64)
     grid = cells((64, 64), strides)
     own, their = 84 - 20, 84
     assert grid[own].tolist() == [0, 0, 16]
     assert grid[their].tolist() == [0, 0, 16]
-    raised = 0.35 / (0.35 + 0.65 * np.exp(-0.5))
-    for first, second, expected in (
-        ((own, 0.35), (their, 0.2), [raised]),
-        ((their, 0.35), (own, 0.2), [raised]),
-        ((own, 0.35), (their, 0.08), []),
-        ((own, 0.35), (own + 1, 0.2), []),
+    raised, raised_grey = (0.35 / (0.35 + 0.65 * np.exp(-by)) for by in (0.5, 0.3))
+    grey, blue = (np.full((64, 64, 3), (level, 0, 0), np.uint8) for level in (0, 2))
+    for first, second, expected, image in (
+        ((own, 0.35), (their, 0.2), [raised], blue),
+        ((their, 0.35), (own, 0.2), [raised], blue),
+        ((own, 0.35), (their, 0.08), [], blue),
+        ((own, 0.35), (own + 1, 0.2), [], blue),
+        ((own, 0.35), (own + 1, 0.2), [raised_grey], grey),
     ):
         table = empty(len(grid), 7)
         for row, score in (first, second):
@@ -335,8 +340,9 @@ def test_what_both_networks_of_a_file_see_is_surer(tmp_path: Path) -> None:
                 1,
                 0,
             ]
-        path = constant_model(tmp_path / "m.onnx", table, metadata={"hvt.training_commit": "1a2b3c4"})
-        found = open_detector(str(path), confidence=0.4).detect(np.zeros((64, 64, 3), np.uint8))
+        metadata = {"hvt.training_commit": "1a2b3c4", "hvt.enlarge_to": "65"}
+        path = constant_model(tmp_path / "m.onnx", table, metadata=metadata)
+        found = open_detector(str(path), confidence=0.4).detect(image)
         np.testing.assert_allclose(found.confidences, expected, rtol=1e-5)
 
 
@@ -411,8 +417,10 @@ def test_a_free_input_takes_the_size_of_the_image_or_of_the_user(tmp_path: Path)
     assert OnnxDetector(open_model(path), size=(416, 320)).input_size((1280, 720)) == (416, 320)
 
 
-def test_a_network_for_small_objects_has_small_images_enlarged(tmp_path: Path) -> None:
-    """On a thermal camera's 640x512 a person is four pixels wide, half of what the network was trained on."""
+def test_a_network_for_small_objects_has_small_images_enlarged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A car of a 640x360 base is six pixels long, within one cell; a thermal camera's people grow too large."""
     path = colour_detector(tmp_path / "m.onnx", "yolox", size=None, metadata={"hvt.enlarge_to": "1280"})
     detector = OnnxDetector(open_model(path))
     sizes = [(640, 512), (854, 480), (1280, 720), (1920, 1080), (320, 240)]
@@ -423,6 +431,17 @@ def test_a_network_for_small_objects_has_small_images_enlarged(tmp_path: Path) -
         (1920, 1088),
         (640, 480),
     ]
+    assert [detector.input_size(size, thermal=True) for size in sizes[:3]] == [
+        (960, 768),
+        (960, 544),
+        (1280, 736),
+    ]
+    inputs: list[tuple[int, ...]] = []
+    run = detector.model.run
+    monkeypatch.setattr(detector.model, "run", lambda *given: inputs.append(given[0].shape) or run(*given))
+    for red in (90, 92):
+        detector.detect(np.full((512, 640, 3), (90, 90, red), np.uint8))
+    assert inputs == [(1, 3, 768, 960), (1, 3, 1024, 1280)]
     image = np.zeros((64, 96, 3), np.uint8)
     image[16:24, 40:48] = (0, 255, 0)
     found = open_detector(str(path), confidence=0.9).detect(image)
