@@ -29,9 +29,11 @@ _STEADY_PAUSES = 10
 
 
 def reason_of(error: BaseException) -> str:
-    """An error in one line: a sentence or a database's message as it is; anything else after its kind."""
+    """An error in one line: a sentence, a database's or the system's words as they are; all else after its kind."""
     said = isinstance(error, UserError) or type(error).__module__ == "sqlite3"
     text = str(error) if said else f"{type(error).__name__}: {error}"
+    if type(error).__module__ == "builtins" and isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return _one_line(text)
 
 

@@ -58,7 +58,7 @@ class Consumer:
         """A session with a recording."""
         self.tried += 1
         if self.broken == "opening":
-            raise OSError(28, "No space left on device")
+            raise OSError(28, "No space left on device", "a.rrd")
         path = self.folder / f"{info.edge}-{len(self.sessions)}.rrd"
         settings = settings_of(info, path)
         sink = QueuedSink("recording", lambda: Recorder(settings), failures=Failures(time.time_ns))
@@ -269,7 +269,7 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert consumer.tried == 1
     assert rig.sessions.idle
     (failed,) = rig.sessions.failures.parts
-    assert failed.reason == "OSError: [Errno 28] No space left on device"
+    assert failed.reason == "a.rrd: No space left on device", "an operator reads no numbers of errors"
     assert f"uav-1: {failed.reason}  session of uav-1 FAILED at" in status_text(
         StateMaker(time.time_ns).make([("uav-1", rig.sessions)])
     )
