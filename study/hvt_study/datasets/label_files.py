@@ -109,10 +109,7 @@ def read_image(path: Path, labelled_size: tuple[int, int] | None = None) -> Imag
     """
     name: Any = os.fsencode(path)  # OpenCV dies of a text that is no UTF-8
     image = cv2.imread(name, cv2.IMREAD_COLOR)
-    if image is not None and labelled_size == (image.shape[0], image.shape[1]) != (
-        image.shape[1],
-        image.shape[0],
-    ):
+    if image is not None and labelled_size and labelled_size == image.shape[:2] != image.shape[1::-1]:
         lying = cv2.imread(name, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         image = lying if lying is not None and lying.shape[:2] == labelled_size[::-1] else image
     return None if image is None else np.asarray(image, np.uint8)

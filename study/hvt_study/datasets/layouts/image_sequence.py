@@ -109,8 +109,7 @@ class ImageSequence:
 
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) in pixels; `UserError` for a file that cannot be decoded."""
-    image = read_image(file)
-    if image is None:
+    if (image := read_image(file)) is None:
         raise UserError(f"{file} cannot be read as an image")
     return image.shape[1], image.shape[0]
 
