@@ -134,11 +134,8 @@ def put_video_first() -> None:
     cv2.setNumThreads(1)
 
 
-def with_lower_priority(call: Callable[[], T], *, stop: threading.Event) -> T | None:
-    """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too.
-
-    None where ``stop`` is set before it is done: a runtime may compile for minutes, and nobody can interrupt it.
-    """
+def in_thread(call: Callable[[], T], *, name: str) -> Future[T]:
+    """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too."""
     done: Future[T] = Future()
 
     def run() -> None:
@@ -148,7 +145,16 @@ def with_lower_priority(call: Callable[[], T], *, stop: threading.Event) -> T | 
         except BaseException as error:  # noqa: BLE001 - raised where it is waited for
             done.set_exception(error)
 
-    threading.Thread(target=run, name="hvt-opening", daemon=True).start()
+    threading.Thread(target=run, name=name, daemon=True).start()
+    return done
+
+
+def with_lower_priority(call: Callable[[], T], *, stop: threading.Event) -> T | None:
+    """Wait for it, `in_thread`.
+
+    None where ``stop`` is set before it is done: a runtime may compile for minutes, and nobody can interrupt it.
+    """
+    done = in_thread(call, name="hvt-opening")
     while not wait([done], timeout=_CHECK_EVERY_S).done:
         if stop.is_set():
             return None

@@ -8,8 +8,7 @@ are being made is in memory. An object without progress is sent again from the g
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 
@@ -38,14 +37,17 @@ _OTHER_RECEIVER_NS = 5 * SECOND_NS
 @dataclass(slots=True)
 class _Transfer:
     entry: Entry
-    total_bytes: int
-    since_ns: int
+    total_bytes: int = -1
+    """-1 until the object was read."""
+    since_ns: int = 0
     """Time of the last chunk sent or acknowledged."""
     sent_bytes: int = 0
     acknowledged_bytes: int = 0
     tries: int = 0
     answers: int = 0
     """Answers of the ground without progress: it is busy."""
+    aside: bool = False
+    """The present ground does not take it; another ground, and the next start, are offered it again."""
 
 
 class Backfill:
@@ -57,18 +59,15 @@ class Backfill:
         self._store = store
         self._session_id = session_id
         self._on_done = on_done
-        self.line: OrderedDict[ObjectKey, _Transfer] = OrderedDict()
+        self._begun: dict[ObjectKey, _Transfer] = {}
+        """Objects of which a ground was sent some, and that none has yet."""
+        self.line: dict[ObjectKey, _Transfer] = {}
+        """Those that are under way, in order."""
         self.data: tuple[ObjectKey, bytes] | None = None
-        self._in_hand: ObjectKey | None = None
+        self._in_hand: _Transfer | None = None
         """The object whose chunks were made last."""
-        self._informed: set[int] = set()
+        self._informed = {session_id}
         """Sessions whose facts the ground has."""
-        self._requested: set[int] = set()
-        """Sessions whose facts the ground has requested."""
-        self._refused: set[ObjectKey] = set()
-        """Objects that the present ground refuses; another ground, and the next start, offer them again."""
-        self._acknowledged: dict[ObjectKey, int] = {}
-        """Bytes that the present ground reports of unfinished objects."""
         self._receiver_id: int | None = None
         self._reported_ns = 0
         self.video_first = False
@@ -84,86 +83,72 @@ class Backfill:
 
     # Acknowledgements
 
-    def on_acknowledged(
-        self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int, now_ns: int
-    ) -> None:
-        """Process a ground's acknowledgements. Only one ground counts, until it has sent none for a while."""
+    def on_acknowledged(self, one: AcknowledgedRange, *, receiver_id: int, now_ns: int) -> None:
+        """Process an acknowledgement. Only one ground counts, until it has sent none for a while."""
         if receiver_id != self._receiver_id:
-            if self._receiver_id is not None and now_ns - self._reported_ns < _OTHER_RECEIVER_NS:
-                return
+            if self._receiver_id is not None:
+                if now_ns - self._reported_ns < _OTHER_RECEIVER_NS:
+                    return
+                self._informed = {self._session_id}
+                self._stop()
+            for begun in self._begun.values():
+                begun.aside = False
             self._receiver_id = receiver_id
-            self._informed.clear()
-            self._refused.clear()
-            self._acknowledged.clear()
         self._reported_ns = now_ns
-        for one in acknowledged_ranges:
-            transfer = self.line.get(one.key)
-            if transfer is not None:
-                self._advance(transfer, one.acknowledged_bytes, now_ns)
-            elif one.key in self._refused:
-                self._late(one.key, one.acknowledged_bytes)
-            elif one.kind == BacklogKind.INFO and not one.acknowledged_bytes and self._store.find(one.key):
-                self._informed.discard(one.session_id)
-                self._requested.add(one.session_id)
-
-    def _late(self, key: ObjectKey, acknowledged_bytes: int) -> None:
-        # The object was set aside although the ground had it.
-        entry = self._store.find(key)
-        data = None if entry is None else self._store.read(entry)
-        if entry is not None and data is not None and acknowledged_bytes == len(data):
-            self._refused.discard(key)
-            self._store.remove(entry)
-            self._on_done(entry)
+        transfer = self._begun.get(one.key)
+        if transfer is not None:
+            self._advance(transfer, one.acknowledged_bytes, now_ns)
+        elif one.kind == BacklogKind.INFO and not (one.number or one.acknowledged_bytes):
+            self._informed.discard(one.session_id)
 
     def interrupt(self) -> None:
         """The link is down: objects under way start again later, from the acknowledged bytes on."""
-        self.line.clear()
-        self.data = None
-        self._forget()
+        self._stop()
+        self._forget_removed()
 
     def put_aside(self) -> None:
         """Making or sending chunks has failed: the object in hand waits for another ground or the next start."""
         if self._in_hand is not None:
-            self._refused.add(self._in_hand)
+            self._in_hand.aside = True
+        self._stop()
+
+    def _stop(self) -> None:
         self.line.clear()
         self.data = None
 
-    def _forget(self) -> None:
-        self._refused = {key for key in self._refused if self._store.find(key) is not None}
-        self._acknowledged = {
-            key: size for key, size in self._acknowledged.items() if self._store.find(key) is not None
-        }
+    def _forget_removed(self) -> None:
+        self._begun = {key: one for key, one in self._begun.items() if self._store.find(key) is not None}
 
     def _advance(self, transfer: _Transfer, acknowledged_bytes: int, now_ns: int) -> None:
         if acknowledged_bytes > transfer.total_bytes:
             return
-        key = transfer.entry.key
-        # By object, not by transfer: after an outage the ground acknowledges the same bytes again.
-        self.acknowledged_bytes += max(0, acknowledged_bytes - self._acknowledged.get(key, 0))
-        self._acknowledged[key] = acknowledged_bytes
+        gained_bytes = acknowledged_bytes - transfer.acknowledged_bytes
+        self.acknowledged_bytes += max(0, gained_bytes)
+        transfer.acknowledged_bytes = acknowledged_bytes
         if acknowledged_bytes == transfer.total_bytes:
-            self._done(transfer)
+            self._done(transfer.entry)
             return
-        if acknowledged_bytes < transfer.acknowledged_bytes:  # the ground was restarted, or lost some
+        if gained_bytes < 0:  # the ground was restarted, or lost some
             transfer.sent_bytes = acknowledged_bytes
-        elif acknowledged_bytes > transfer.acknowledged_bytes:
+        elif gained_bytes > 0:
             transfer.tries, transfer.answers, transfer.since_ns = 0, 0, now_ns
         elif transfer.answers < _MOST_ANSWERS:  # the ground is busy: only silence is a failed try
             transfer.tries, transfer.answers = 0, transfer.answers + 1
-        transfer.acknowledged_bytes = acknowledged_bytes
         transfer.sent_bytes = max(transfer.sent_bytes, acknowledged_bytes)
 
-    def _done(self, transfer: _Transfer) -> None:
-        entry = transfer.entry
+    def _done(self, entry: Entry) -> None:
         self._leave(entry.key)
-        self._acknowledged.pop(entry.key, None)
         if entry.kind is BacklogKind.INFO:
             self._informed.add(entry.session_id)
             return
-        self._store.remove(entry)
+        if (
+            stored := self._store.find(entry.key)
+        ) is not None:  # else evicted: its row may be another's by now
+            self._store.remove(stored)
         self._on_done(entry)
 
     def _leave(self, key: ObjectKey) -> None:
+        self._begun.pop(key, None)
         self.line.pop(key, None)
         if self.data is not None and self.data[0] == key:
             self.data = None
@@ -204,67 +189,63 @@ class Backfill:
                     self._give_up(transfer)
 
     def _give_up(self, transfer: _Transfer) -> None:
-        self._leave(transfer.entry.key)
+        entry = transfer.entry
+        self._leave(entry.key)
         self.given_up += 1
         if self.given_up.bit_count() == 1:
             _log.warning(
                 "no ground takes %s in %d tries (%d objects so far): it stays on disk for another ground, or for "
                 "the next start",
-                transfer.entry,
+                entry,
                 transfer.tries,
                 self.given_up,
             )
-        if transfer.entry.kind is BacklogKind.INFO:
-            self._requested.discard(transfer.entry.session_id)
-            self._informed.add(transfer.entry.session_id)  # later reports show whether it is needed
+        if entry.kind is BacklogKind.INFO:
+            self._informed.add(entry.session_id)  # later reports show whether it is needed
         else:  # an object leaves the store only because a ground has it, for its age or for want of room
-            self._forget()
-            self._refused.add(transfer.entry.key)
+            self._forget_removed()
+            transfer.aside = True
+            self._begun[entry.key] = transfer  # an acknowledgement may still come
 
     def _current(self, now_ns: int) -> _Transfer | None:
         # The object whose chunks are made now: the first that is not entirely under way, or the next one.
         for transfer in self.line.values():
             if transfer.sent_bytes < transfer.total_bytes:
-                self._in_hand = transfer.entry.key
+                self._in_hand = transfer
                 ahead = transfer.sent_bytes - transfer.acknowledged_bytes
                 return transfer if ahead < _MOST_AHEAD_BYTES else None
         if len(self.line) >= _MOST_OBJECTS:
             return None
         while (entry := next(self._open_entries(), None)) is not None:
-            self._in_hand = entry.key
-            data = self._store.read(entry)
-            if data is not None:
-                self.data = (entry.key, data)
-                transfer = self.line[entry.key] = _Transfer(entry, len(data), now_ns)
+            transfer = self._in_hand = self._begun.setdefault(entry.key, _Transfer(entry))
+            if self._bytes_of(transfer) is not None:
+                transfer.sent_bytes, transfer.since_ns = transfer.acknowledged_bytes, now_ns
+                transfer.tries = transfer.answers = 0
+                self.line[entry.key] = transfer
                 return transfer
         return None
 
     def _open_entries(self) -> Iterator[Entry]:
-        for session_id in sorted(self._requested - self._informed):
-            info = self._store.info_of(session_id)
-            if info is None:
-                self._requested.discard(session_id)
-            elif info.key not in self.line:
-                yield info
         stills, video = self._store.best_stills(), self._store.newest_segments()
-        if self.video_first and not self._store.segments:
+        if not self._store.segments:
             self.video_first = False
-        for entry in chain(video, stills) if self.video_first else chain(stills, video):
-            if entry.key in self.line or entry.key in self._refused:
+        under_way = [one.entry for one in self.line.values()]
+        for entry in chain(under_way, *((video, stills) if self.video_first else (stills, video))):
+            key, begun = entry.key, self._begun.get(entry.key)
+            if begun is not None and begun.aside:
                 continue
-            info = self._store.info_of(entry.session_id)
-            if entry.session_id == self._session_id or entry.session_id in self._informed or info is None:
-                yield entry
-            elif info.key not in self.line:
-                yield info
+            informed = entry.session_id in self._informed
+            info = None if informed else self._store.info_of(entry.session_id)
+            if (key if info is None else info.key) not in self.line:
+                yield entry if info is None else info
 
     def _bytes_of(self, transfer: _Transfer) -> bytes | None:
         # The object's bytes, read again if another object was read since; None where they are gone.
         key = transfer.entry.key
         if self.data is None or self.data[0] != key:
             data = self._store.read(transfer.entry)
-            if data is None or len(data) != transfer.total_bytes:
+            if data is None or transfer.total_bytes not in (-1, len(data)):
                 self._leave(key)
                 return None
-            self.data = (key, data)
+            transfer.total_bytes, self.data = len(data), (key, data)
         return self.data[1]

@@ -68,7 +68,7 @@ PRAGMA temp_store = MEMORY;
 PRAGMA wal_autocheckpoint = 64;
 BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS object (
-    id INTEGER PRIMARY KEY, session TEXT NOT NULL, kind TEXT NOT NULL, number INTEGER NOT NULL,
+    id INTEGER PRIMARY KEY AUTOINCREMENT, session TEXT NOT NULL, kind TEXT NOT NULL, number INTEGER NOT NULL,
     capture_ns INTEGER NOT NULL, rank REAL NOT NULL, bytes INTEGER NOT NULL, span_ns INTEGER NOT NULL,
     UNIQUE (session, kind, number) ON CONFLICT REPLACE);
 CREATE INDEX IF NOT EXISTS object_rank ON object (kind, rank, bytes, span_ns);
@@ -83,7 +83,8 @@ COMMIT;
 """
 # `stored` is the time of the newest object, by both clocks; `object.capture_ns` is by the clock of the run that has
 # it. `gone` lists objects that have arrived and cannot be deleted yet, because a full disk has no space for the log
-# either. After a kill the segment that was open has no size yet.
+# either. No row of an object is used again: the entry of an evicted one is never that of another. After a kill the
+# segment that was open has no size yet.
 _ADOPT = """
 UPDATE object SET
     bytes = (SELECT total(length(data)) FROM part WHERE object = object.id),
@@ -396,11 +397,8 @@ class Store:
 
     def _move_times(self, db: sqlite3.Connection) -> None:
         found = db.execute("SELECT capture_ns, boot, steady_ns FROM stored").fetchone()
-        if found is None:  # written by a version that did not note it, if by any
-            (newest_ns,) = db.execute("SELECT max(capture_ns) FROM object WHERE kind <> 'info'").fetchone()
-            if newest_ns is None:
-                return
-            found = newest_ns, "", 0
+        if found is None:
+            return
         now_ns = self.clock()
         most_ns = round(max(0, now_ns - self.oldest_ns) * _TRUSTED_SHARE)
         moved_ns = unwitnessed_ns(Moment(*found), Moment(now_ns, *self.since_boot()), most_ns=most_ns)

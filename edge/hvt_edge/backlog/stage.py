@@ -17,8 +17,8 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
-from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreWorker
-from hvt_edge.link.transmitter import LEAST_CHUNK_BYTES, Transmitter
+from hvt_edge.backlog.worker import IntakeStill, StoreWorker
+from hvt_edge.link.transmitter import LEAST_CHUNK_BYTES, Chunk, Transmitter
 from hvt_edge.operating import Keyframes
 
 SILENCE_NS = 3 * SECOND_NS // 2
@@ -36,8 +36,9 @@ _STEADY_NS = 2 * SECOND_NS
 _PROBE_NS = SECOND_NS
 _RESERVE = 1 / 3
 """Share of the stills' part of a window that stays free for a live one; all of it while one is pending."""
-_TRICKLE_BYTES = 1_400
-"""Size of a chunk that goes without room in the budget: one packet."""
+_TRICKLE_BYTES, _TRICKLE_SHARE = 1_400, 1 / 40
+"""Size of a chunk that goes without room in the budget, one packet; and the share of the total that belongs to the
+backlog, so that other traffic cannot keep it waiting for ever."""
 _FINISH_NS, _STUCK_NS, _POLL_S = 60 * SECOND_NS, 6 * SECOND_NS, 0.05
 """How long sending goes on after the end of a clip: in all, and without progress."""
 
@@ -149,7 +150,7 @@ class BacklogStage:
         self._linked = self._finishing = False
         self._back_ns = clock()
         self._segment_ns: int | None = None
-        self._probed_ns = 0
+        self._probed_ns = self._trickle_ns = 0
         self.frames = 0
         """Frames stored to be sent later; they include those also sent as probes of whether the link is back."""
         self.max_bytes = store.max_bytes
@@ -160,9 +161,8 @@ class BacklogStage:
             session_id=line.session_id,
             clock=clock,
             allowance=self.chunk_allowance,
-            send=lambda chunk: line.backlog(chunk, now_ns=clock()),
+            send=self.send_chunk,
             round_trip_ns=lambda: line.round_trip_ns,
-            total_bps=lambda: line.budget.total_bps,
             failures=failures,
             on_sent=self._note_sent,
         )
@@ -322,18 +322,28 @@ class BacklogStage:
 
     # How chunks leave
 
-    def chunk_allowance(self, now_ns: int) -> ChunkAllowance | None:
-        """Allowance of a chunk now. None: the link is not steady, no ground reports, or a keyframe is due."""
+    def chunk_allowance(self, now_ns: int) -> int:
+        """Limit of a chunk now. 0: the link is full or not steady, no ground reports, or a keyframe is due."""
         if self.state is not State.LIVE or not self._linked or now_ns - self._back_ns < _STEADY_NS:
-            return None
+            return 0
         if not self._outage.reports_now(now_ns):
-            return None  # a ground that only listens acknowledges nothing
+            return 0  # a ground that only listens acknowledges nothing
         # While a keyframe is due nothing else takes its room; after the last frame none is due.
         if not self._has_subscriber() or not (self._finishing or not self._keyframes.due(now_ns)):
-            return None
+            return 0
         reserve = 0.0 if self._finishing else 1.0 if self._stills_pending() else _RESERVE
         limit_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=reserve)
         if self._finishing or limit_bytes >= LEAST_CHUNK_BYTES:
-            return ChunkAllowance(limit_bytes)  # after the last frame no still is sent any more
-        own_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=None)
-        return ChunkAllowance(min(_TRICKLE_BYTES, own_bytes), trickle=True)
+            return limit_bytes  # after the last frame no still is sent any more
+        if now_ns < self._trickle_ns:
+            return 0
+        return min(_TRICKLE_BYTES, self._line.backlog_allowance_bytes(now_ns, reserve=None))
+
+    def send_chunk(self, chunk: Chunk) -> int:
+        """Send it; its line bytes, 0 where its room is gone. Without room in the budget the next one has to wait."""
+        now_ns = self._clock()
+        line_bytes = self._line.backlog(chunk, now_ns=now_ns)
+        if line_bytes:
+            pause_s = 8 * line_bytes / (_TRICKLE_SHARE * self._line.budget.total_bps)
+            self._trickle_ns = now_ns + round(pause_s * SECOND_NS)
+        return line_bytes

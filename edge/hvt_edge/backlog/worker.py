@@ -3,7 +3,8 @@
 Objects wait for it in a bounded queue (`Intake`). When the queue is full the disk is too slow: later objects are not
 stored, and the log says so once. While a disk is full, read-only or gone, nothing is stored; objects already there
 are sent all the same. Any other error, of a file that another program has changed or of this one, stops storing or
-sending alone, which is tried again: video needs neither. Chunks leave in a thread of their own (`ChunkThread`).
+sending alone, which is tried again: video needs neither. Each chunk leaves in a thread of its own, because a link
+that is full for seconds must not hold up the disk.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ import shutil
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 
 from hvt_common.protocol.messages import (
     AcknowledgedRange,
@@ -26,7 +27,7 @@ from hvt_common.protocol.messages import (
     pack_backlog_still,
 )
 from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
-from hvt_common.runtime.process import lower_priority
+from hvt_common.runtime.process import in_thread, lower_priority
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
@@ -165,17 +166,6 @@ _LAST_CHUNK_S = 1.0
 """Time that the last chunk has to leave."""
 _MEASURED_NS, _OLD_NS = SECOND_NS, 5 * SECOND_NS
 """How often the disk's free space is measured, and how long a measurement counts."""
-_TRICKLE_SHARE = 1 / 40
-"""Share of the total that belongs to the backlog, so that other traffic cannot keep it waiting for ever."""
-
-
-@dataclass(frozen=True, slots=True)
-class ChunkAllowance:
-    """The limit of a chunk that is sent now."""
-
-    limit_bytes: int
-    trickle: bool = False
-    """The budget has no room: small chunks are sent all the same, with pauses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,8 +195,10 @@ class StoreNumbers:
 class StoreWorker:
     """Stores, sends, and closes the store; all disk access runs in its thread.
 
-    Any error of storing or sending goes to ``failures``, and the work is tried again.
-    ``on_sent(entry)`` is called for each object that a ground has completely. `close` waits ``close_s`` for the disk.
+    Any error of storing or sending goes to ``failures``, and the work is tried again. ``allowance(now_ns)`` is the
+    limit of a chunk, 0 where none may be sent. ``send(chunk)``, which may block, returns its line bytes, 0 where it
+    was not sent. ``on_sent(entry)`` is called for each object that a ground has completely. `close` waits ``close_s``
+    for the disk.
     """
 
     def __init__(
@@ -215,18 +207,16 @@ class StoreWorker:
         *,
         session_id: int,
         clock: Callable[[], int],
-        allowance: Callable[[int], ChunkAllowance | None],
+        allowance: Callable[[int], int],
         send: Callable[[Chunk], int],
         round_trip_ns: Callable[[], int],
-        total_bps: Callable[[], int],
         failures: Failures,
         on_sent: Callable[[Entry], None] = lambda _entry: None,
         close_s: float = _CLOSE_S,
     ) -> None:
         self._store = store
-        self._allowance = allowance
+        self._allowance, self._send = allowance, send
         self._round_trip_ns = round_trip_ns
-        self._total_bps = total_bps
         self._clock = clock
         self._failures = failures
         self._on_sent = on_sent
@@ -234,9 +224,12 @@ class StoreWorker:
         self._backfill = Backfill(store, session_id=session_id, on_done=self._note_done)
         self.intake = Intake(_QUEUE)
         """Takes signals directly; objects to store come by `offer`."""
-        self._sending = ChunkThread(send, on_done=self.intake.signal)
-        self._sent_stills = self._sent_ns = self._trickle_ns = 0
-        self._slow = False
+        self._sending: tuple[Chunk, Future[int]] | None = None
+        """The chunk that was sent last, until its outcome is noted."""
+        self._link = threading.Lock()
+        """Held while a chunk is being sent."""
+        self._sent_stills = self._sent_ns = 0
+        self._slow = self._sends_no_more = False
         self._free: tuple[int, int | None] | None = None
         """When the disk's free bytes were measured, and their number."""
         self._too_large = 0
@@ -299,9 +292,14 @@ class StoreWorker:
         free = self._free
         return free[1] if free is not None and self._clock() - free[0] < _OLD_NS else None
 
-    def send_no_more(self) -> None:
-        """Send no chunk from now on, so that the counts can be final; new objects are still stored."""
-        self._sending.close(_LAST_CHUNK_S)
+    def send_no_more(self, within_s: float = _LAST_CHUNK_S) -> None:
+        """Send no chunk from now on, so that the counts can be final; new objects are still stored.
+
+        The chunk under way has ``within_s`` to leave.
+        """
+        self._sends_no_more = True
+        if self._link.acquire(timeout=within_s):
+            self._link.release()
 
     def close(self) -> None:
         """Write the queue, close the file, join the thread. A disk that hangs costs the queue, and a warning."""
@@ -314,7 +312,7 @@ class StoreWorker:
                 self._close_s,
                 len(self.intake),
             )
-        self._sending.close(self._close_s)
+        self.send_no_more(self._close_s)
         self.check()
 
     # In the thread
@@ -383,7 +381,7 @@ class StoreWorker:
             self._backfill.interrupt()
         self._backfill.video_first |= news.video_first
         for (receiver_id, _), one in news.acknowledged.items():
-            self._backfill.on_acknowledged([one], receiver_id=receiver_id, now_ns=self._clock())
+            self._backfill.on_acknowledged(one, receiver_id=receiver_id, now_ns=self._clock())
 
     def _add(self, item: AccessUnit | IntakeStill) -> None:
         if isinstance(item, AccessUnit):
@@ -393,23 +391,30 @@ class StoreWorker:
             self._store.add_still(item.number, data, utility=item.utility, capture_ns=item.capture_ns)
 
     def _send_chunk(self) -> None:
-        done = self._sending.take()
-        if done is not None and not done[1]:
-            self._backfill.take_back(done[0])  # and wait a moment: other messages are being sent
-            return
-        now_ns = self._clock()
-        if done is not None:
+        if self._sending is not None:
+            chunk, sent = self._sending
+            if not sent.done():
+                return
+            self._sending = None
+            if not sent.result():
+                self._backfill.take_back(chunk)  # and wait a moment: other messages are being sent
+                return
             self._failures.works(_SENDING_PART)
-            pause_ns = 8 * SECOND_NS * done[1] / (_TRICKLE_SHARE * self._total_bps())
-            self._trickle_ns = now_ns + round(pause_ns)
-        allowance = self._allowance(now_ns) if self._sending.ready else None
-        if allowance is None or (allowance.trickle and now_ns < self._trickle_ns):
+        now_ns = self._clock()
+        limit_bytes = 0 if self._sends_no_more else self._allowance(now_ns)
+        if not limit_bytes:
             return
-        chunk = self._backfill.next_chunk(
-            allowance.limit_bytes, now_ns=now_ns, round_trip_ns=self._round_trip_ns()
+        next_chunk = self._backfill.next_chunk(
+            limit_bytes, now_ns=now_ns, round_trip_ns=self._round_trip_ns()
         )
-        if chunk is not None:
-            self._sending.put(chunk)
+        if next_chunk is not None:
+            sent = in_thread(partial(self._send_now, next_chunk), name="hvt-backlog")
+            self._sending = next_chunk, sent
+            sent.add_done_callback(lambda _sent: self.intake.signal())
+
+    def _send_now(self, chunk: Chunk) -> int:
+        with self._link:
+            return 0 if self._sends_no_more else self._send(chunk)
 
     def _note_done(self, entry: Entry) -> None:
         self._sent_stills += entry.kind is BacklogKind.STILL
@@ -427,55 +432,3 @@ def _free_bytes(folder: Path) -> int | None:
         except OSError:
             break
     return None
-
-
-class ChunkThread:
-    """Sends one chunk at a time in a thread of its own: a link that is full for seconds must not hold up the disk.
-
-    `put`, `take` and `ready` are for one thread; ``on_done()`` is called in the sending thread after each chunk.
-    ``send(chunk)`` returns the line bytes, 0 where it was not sent; it may block.
-    """
-
-    def __init__(self, send: Callable[[Chunk], int], *, on_done: Callable[[], None]) -> None:
-        self._send = send
-        self._on_done = on_done
-        self._chunks: SimpleQueue[Chunk | None] = SimpleQueue()
-        self._done: SimpleQueue[tuple[Chunk, int | BaseException]] = SimpleQueue()
-        self._closed = self._busy = False
-        self._thread = threading.Thread(target=self._run, name="hvt-backlog", daemon=True)
-        self._thread.start()
-
-    @property
-    def ready(self) -> bool:
-        """Whether it takes another chunk: none is being sent, and `take` has returned the last one."""
-        return not (self._busy or self._closed)
-
-    def put(self, chunk: Chunk) -> None:
-        """Send this chunk; only while it is `ready`."""
-        self._busy = True
-        self._chunks.put(chunk)
-
-    def take(self) -> tuple[Chunk, int] | None:
-        """The chunk sent last and its line bytes, once; None until it was sent. Raises the error of ``send``."""
-        if self._done.empty():
-            return None
-        chunk, sent = self._done.get()
-        self._busy = False
-        if isinstance(sent, BaseException):
-            raise sent
-        return chunk, sent
-
-    def close(self, timeout_s: float) -> None:
-        """Send no more, and count the queue as not sent; the chunk under way has ``timeout_s`` to leave."""
-        self._closed = True
-        self._chunks.put(None)
-        self._thread.join(timeout=timeout_s)
-
-    def _run(self) -> None:
-        lower_priority()
-        while (chunk := self._chunks.get()) is not None:
-            try:
-                self._done.put((chunk, 0 if self._closed else self._send(chunk)))
-            except BaseException as error:  # noqa: BLE001 - handed to the disk thread, which hands it on
-                self._done.put((chunk, error))
-            self._on_done()

@@ -90,10 +90,8 @@ class Rig:
 
     def report(self) -> None:
         """What the ground has to say."""
-        acknowledged_ranges = self.ground.assembly.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES)
-        self.backfill.on_acknowledged(
-            acknowledged_ranges, receiver_id=self.ground.receiver_id, now_ns=self.now_ns
-        )
+        for one in self.ground.assembly.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES):
+            self.backfill.on_acknowledged(one, receiver_id=self.ground.receiver_id, now_ns=self.now_ns)
 
 
 def fill(folder, *, stills: int = 6) -> None:
@@ -183,6 +181,21 @@ def test_after_an_outage_it_goes_on_where_the_ground_left_off(tmp_path):
         assert resent <= 4 * 5000, "what went out before the first report"
 
 
+def test_what_arrived_before_an_outage_is_not_sent_after_it(tmp_path):
+    """The link breaks before the report: a link that flaps would carry the same stills again and again."""
+    with opened(tmp_path) as folder:
+        fill(folder)
+        rig = Rig(folder)
+        rig.run(0.6, reports=False)
+        sent = len(rig.sent)
+        rig.backfill.interrupt()
+        rig.report()
+        assert folder.stills == 0
+        rig.run(15)
+        assert set(rig.ground.twice.values()) == {1}
+        assert {chunk.key[1] for chunk in rig.sent[sent:]} == {"base"}
+
+
 def test_a_ground_that_was_started_again_gets_it_from_the_beginning(tmp_path):
     """The object would be complete for the edge and half for the ground."""
     with opened(tmp_path) as folder:
@@ -234,7 +247,7 @@ def test_a_ground_that_answers_is_busy_and_not_gone(tmp_path):
         for _ in range(60):
             rig.run(1, reports=False)
             acknowledged_range = AcknowledgedRange(session_id=7, kind=key[1], number=1, acknowledged_bytes=0)
-            rig.backfill.on_acknowledged([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
+            rig.backfill.on_acknowledged(acknowledged_range, receiver_id=1, now_ns=rig.now_ns)
         assert rig.backfill.given_up == 0
         rig.listening = True
         rig.run(5)
@@ -247,7 +260,6 @@ def test_a_word_that_comes_late_still_counts(tmp_path):
     with opened(tmp_path) as folder:
         add_stills(folder, {1: 1.0})
         rig = Rig(folder)
-        rig.report()  # it is the one that counts
         rig.run(30, reports=False)
         assert rig.backfill.given_up == 1
         ((_, data),) = rig.ground.objects.items()
@@ -255,7 +267,7 @@ def test_a_word_that_comes_late_still_counts(tmp_path):
             acknowledged_range = AcknowledgedRange(
                 session_id=7, kind=BacklogKind.STILL, number=1, acknowledged_bytes=acknowledged_bytes
             )
-            rig.backfill.on_acknowledged([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
+            rig.backfill.on_acknowledged(acknowledged_range, receiver_id=1, now_ns=rig.now_ns)
             assert folder.stills == left
         assert rig.done == [(7, BacklogKind.STILL, 1)]
 
@@ -287,17 +299,14 @@ def test_reports_of_nonsense_and_of_other_grounds_change_nothing(tmp_path):
         def acknowledged_range(bytes_: int, *, number: int = 0, kind: str = "base") -> AcknowledgedRange:
             return AcknowledgedRange(session_id=7, kind=kind, number=number, acknowledged_bytes=bytes_)
 
-        rig.backfill.on_acknowledged([acknowledged_range(total)], receiver_id=99, now_ns=rig.now_ns)
-        rig.backfill.on_acknowledged(
-            [
-                acknowledged_range(total + 1),
-                acknowledged_range(5, number=77),
-                acknowledged_range(0, kind="still"),
-                acknowledged_range(0, kind="info", number=4),
-            ],
-            receiver_id=1,
-            now_ns=rig.now_ns,
-        )
+        rig.backfill.on_acknowledged(acknowledged_range(total), receiver_id=99, now_ns=rig.now_ns)
+        for nonsense in (
+            acknowledged_range(total + 1),
+            acknowledged_range(5, number=77),
+            acknowledged_range(0, kind="still"),
+            acknowledged_range(0, kind="info", number=4),
+        ):
+            rig.backfill.on_acknowledged(nonsense, receiver_id=1, now_ns=rig.now_ns)
         assert folder.segments == 1
         rig.run(20)
         assert len(rig.ground.objects) == 1
@@ -308,13 +317,11 @@ def test_only_facts_that_are_here_can_be_asked_for(tmp_path):
     with opened(tmp_path) as folder:
         add_stills(folder, {1: 1.0})
         backfill = Backfill(folder, session_id=7)
-        strangers = [
-            AcknowledgedRange(session_id=n, kind="info", number=0, acknowledged_bytes=0)
-            for n in range(7, 2000)
-        ]
-        backfill.on_acknowledged(strangers, receiver_id=1, now_ns=1)
+        for session_id in range(7, 2000):
+            asked = AcknowledgedRange(session_id=session_id, kind="info", number=0, acknowledged_bytes=0)
+            backfill.on_acknowledged(asked, receiver_id=1, now_ns=1)
         sent = [backfill.next_chunk(10_000, now_ns=2, round_trip_ns=RTT) for _ in range(3)]
-        assert [one.key[:2] for one in sent if one] == [(7, "info"), (7, "still")]
+        assert [one.key[:2] for one in sent if one] == [(7, "info")], "then the objects"
 
 
 def test_bytes_count_as_arrived_once_whatever_the_link_does(tmp_path):
@@ -355,6 +362,20 @@ def test_a_file_that_goes_while_it_is_sent_stops_nothing(tmp_path):
         rig.run(20)
         assert (folder.stills, folder.segments) == (0, 0)
         assert {key[2] for key in rig.ground.objects if key[1] == "base"} >= {0, 150}
+
+
+def test_an_arrival_removes_no_other_object_from_the_disk(tmp_path):
+    """A still that made room while it was under way had its row taken by the next, which went when it arrived."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        rig = Rig(folder)
+        rig.run(0.1, reports=False)
+        (evicted,) = folder.best_stills()
+        folder.remove(evicted)
+        add_stills(folder, {2: 1.0})
+        rig.report()
+        assert rig.done == [evicted.key]
+        assert [one.number for one in folder.best_stills()] == [2]
 
 
 def test_pieces_are_no_smaller_than_they_are_worth(tmp_path):

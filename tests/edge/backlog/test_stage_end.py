@@ -6,7 +6,7 @@ import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_edge.backlog.entry import worth
-from hvt_edge.backlog.worker import ChunkAllowance
+from hvt_edge.link.transmitter import Chunk
 from hvt_edge.stills.outbox import OutboxStill
 from programs.processes import eventually
 from rigs.keeping import PENDING, STILL, Rig
@@ -170,16 +170,16 @@ def test_only_to_who_reports_is_anything_sent_that_was_kept(tmp_path):
         add_stills(folder, {1: 1.0})
     rig = Rig(tmp_path / "store")
     rig.play(0, 60)
-    assert rig.backlog.chunk_allowance(rig.now_ns) is None
+    assert not rig.backlog.chunk_allowance(rig.now_ns)
     rig.report()
-    assert rig.backlog.chunk_allowance(rig.now_ns) is not None
-    assert rig.backlog.chunk_allowance(rig.now_ns + 2 * S) is None, "it has fallen silent"
+    assert rig.backlog.chunk_allowance(rig.now_ns)
+    assert not rig.backlog.chunk_allowance(rig.now_ns + 2 * S), "it has fallen silent"
     rig.backlog.close()
 
 
 def _fill(rig: Rig, *, first: int) -> int:
     # Live stills go out, by number, until there is no room for a whole chunk.
-    while not rig.backlog.chunk_allowance(rig.now_ns).trickle:
+    while rig.backlog.chunk_allowance(rig.now_ns) not in (0, 1400):
         rig.still(first)
         first += 1
     return first
@@ -189,27 +189,45 @@ def test_what_may_be_sent_now_and_how_much(tmp_path):
     """Backfill would go before the picture, or before a live still."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
-    assert rig.backlog.chunk_allowance(rig.now_ns) is None, "the link is two seconds old at the least"
+    assert not rig.backlog.chunk_allowance(rig.now_ns), "the link is two seconds old at the least"
     rig.play(21, 60, reports=True)
-    assert rig.backlog.chunk_allowance(rig.now_ns) is not None
+    assert rig.backlog.chunk_allowance(rig.now_ns)
     rig.keyframes.request(rig.now_ns)
-    assert rig.backlog.chunk_allowance(rig.now_ns) is None, "a keyframe is to come"
+    assert not rig.backlog.chunk_allowance(rig.now_ns), "a keyframe is to come"
     rig.play(60, 75, reports=True)
-    assert rig.backlog.chunk_allowance(rig.now_ns) is not None
+    assert rig.backlog.chunk_allowance(rig.now_ns)
     pending = OutboxStill(PENDING, None, 1.0, rig.now_ns)
-    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(5000), "50 ms of 800 kbps"
+    assert rig.backlog.chunk_allowance(rig.now_ns) == 5000, "50 ms of 800 kbps"
     rig.outbox.offer(pending)
     sent = _fill(rig, first=0)
     rig.outbox.give_up(pending)
-    assert not rig.backlog.chunk_allowance(rig.now_ns).trickle, (
+    assert rig.backlog.chunk_allowance(rig.now_ns) != 1400, (
         "all that stills have was kept for the pending one"
     )
     _fill(rig, first=sent)
-    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(1400, trickle=True), (
+    assert rig.backlog.chunk_allowance(rig.now_ns) == 1400, (
         "a third of the stills' share stays free, but for the backlog's own"
     )
     rig.play(75, 90, linked=False)
-    assert rig.backlog.chunk_allowance(rig.now_ns) is None
+    assert not rig.backlog.chunk_allowance(rig.now_ns)
+    rig.backlog.close()
+
+
+def test_where_live_stills_always_wait_a_trickle_goes_on(tmp_path):
+    """A busy scene would keep what was admitted before from ever arriving; or be held up by it."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 60, reports=True)
+    rig.outbox.offer(OutboxStill(PENDING, None, 1.0, rig.now_ns))
+    _fill(rig, first=0)
+    sent_ns = []
+    for _ in range(60):
+        rig.now_ns += S // 20
+        rig.report()
+        _fill(rig, first=rig.sender.still_sequence + 1)
+        if limit_bytes := rig.backlog.chunk_allowance(rig.now_ns):
+            assert rig.backlog.send_chunk(Chunk((7, "still", 0), 0, 10_000, bytes(limit_bytes)))
+            sent_ns.append(rig.now_ns)
+    assert 4 <= len(sent_ns) <= 6, "1400 bytes and their headers in .6 s, a fortieth of 800 kbps"
     rig.backlog.close()
 
 
@@ -258,7 +276,7 @@ def test_the_largest_chunk_of_a_small_budget_is_a_whole_one(tmp_path, monkeypatc
     rig = Rig(tmp_path / "store")
     rig.play(0, 60, reports=True)
     monkeypatch.setattr(rig.sender, "backlog_allowance_bytes", lambda _now_ns, *, reserve: 1_000)
-    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(1_000)
+    assert rig.backlog.chunk_allowance(rig.now_ns) == 1_000
 
 
 def test_an_error_in_the_stores_thread_ends_storing_alone(tmp_path):

@@ -8,7 +8,6 @@ import sqlite3
 import threading
 import time
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.worker import ChunkAllowance, EndSegment, Intake, StoreWorker
+from hvt_edge.backlog.worker import EndSegment, Intake, StoreWorker
 from hvt_edge.link.transmitter import Chunk
 from media.clips import START_NS
 from programs.processes import eventually
@@ -31,8 +30,7 @@ UNIT = UNITS[0]
 class Link:
     """How pieces leave, and what was sent; it may be `full`, so that sending blocks."""
 
-    def __init__(self, *, live_waits: bool = False) -> None:
-        self.waits = live_waits
+    def __init__(self) -> None:
         self.full = threading.Event()
         self.full.set()
         self.entered = threading.Event()
@@ -44,11 +42,9 @@ class Link:
         self.sent: list[tuple[int, Chunk]] = []
         self.failures = Failures(lambda: self.now_ns)
 
-    def allowance(self, now_ns: int) -> ChunkAllowance | None:
-        """Of a chunk; None while the link is not there."""
-        if not self.open:
-            return None
-        return ChunkAllowance(1400, trickle=True) if self.waits else ChunkAllowance(5000)
+    def allowance(self, now_ns: int) -> int:
+        """Of a chunk; 0 while the link is not there."""
+        return 5000 if self.open else 0
 
     def send(self, chunk: Chunk) -> int:
         """Send it."""
@@ -73,7 +69,6 @@ def worker_of(
         allowance=link.allowance,
         send=send or link.send,
         round_trip_ns=lambda: S // 10,
-        total_bps=lambda: 800_000,
         failures=link.failures,
         close_s=close_s,
     )
@@ -249,27 +244,6 @@ def test_a_piece_whose_room_is_gone_comes_next_and_no_hole_is_left(tmp_path):
     assert [offset for offset, _ in offsets] == [
         sum(size for _, size in offsets[:n]) for n in range(len(offsets))
     ]
-
-
-def test_where_live_stills_always_wait_a_trickle_goes_on(tmp_path):
-    """A busy scene would keep what was admitted before from ever arriving; or be held up by it."""
-    with opened(tmp_path / "store") as folder:
-        add_units(folder, UNITS)
-    link = Link(live_waits=True)
-    worker = worker_of(tmp_path / "store", link)
-    eventually(lambda: len(link.sent) == 1, what="the first piece")
-    for _ in range(400):
-        before = len(link.sent)
-        link.now_ns += S // 10
-        time.sleep(0.03)  # more than a turn of the worker
-        assert len(link.sent) - before <= 1
-        if before >= 3:
-            break
-    worker.close()
-    times = [at_ns for at_ns, _ in link.sent]
-    assert all(later - earlier >= S // 2 for earlier, later in pairwise(times))
-    assert len(times) >= 3
-    assert {len(chunk.data) for _, chunk in link.sent} == {1400}
 
 
 def test_a_folder_that_vanishes_in_mid_flight_is_made_again(tmp_path, caplog):
