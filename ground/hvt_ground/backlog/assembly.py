@@ -13,7 +13,6 @@ one byte.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
 
 from hvt_common.protocol.messages import (
     MAX_BACKLOG_BYTES,
@@ -43,19 +42,6 @@ BacklogContent = Info | ReceivedStill | tuple[BacklogUnit, ...]
 """The content of an object: the facts of its session, a still, or a stretch of the base stream."""
 
 
-@dataclass(slots=True)
-class _Open:
-    total_bytes: int
-    data: bytearray = field(default_factory=bytearray)
-    handed: bool = False
-    """It is complete and handed out, and its outcome is not known yet."""
-
-    @property
-    def size_bytes(self) -> int:
-        """Its bytes, here or in the stage that it was handed to."""
-        return self.total_bytes if self.handed else len(self.data)
-
-
 class BacklogAssembly:
     """Assembles the chunks of one edge. Not safe for threads.
 
@@ -68,7 +54,10 @@ class BacklogAssembly:
     ) -> None:
         self._max_objects = max_objects
         self._max_bytes = max_bytes
-        self._open: OrderedDict[ObjectKey, _Open] = OrderedDict()
+        self._open: OrderedDict[ObjectKey, tuple[int, bytearray]] = OrderedDict()
+        """The size of an object and its beginning, as far as it has come; the newest at the end."""
+        self._handed: dict[ObjectKey, int] = {}
+        """Sizes of objects that are complete and handed out, and whose outcome is not known yet."""
         self._done: Newest[ObjectKey, int] = Newest(remember)
         self._refusals: Newest[ObjectKey, int] = Newest(_MAX_REFUSALS)
         self._unreported: Newest[ObjectKey, int] = Newest(_MAX_UNREPORTED)
@@ -76,12 +65,17 @@ class BacklogAssembly:
     @property
     def size_bytes(self) -> int:
         """The bytes of the objects in progress and of those handed out."""
-        return sum(entry.size_bytes for entry in self._open.values())
+        return sum(len(data) for _, data in self._open.values()) + sum(self._handed.values())
 
     @property
     def in_progress(self) -> int:
         """Number of objects of which some is held or handed out."""
-        return len(self._open)
+        return len(self._open) + self.handed
+
+    @property
+    def handed(self) -> int:
+        """Number of objects that are handed out."""
+        return len(self._handed)
 
     def chunk(self, header: BacklogHeader, payload: bytes, *, may_finish: bool = True) -> bytes | None:
         """Take a chunk; the object's bytes where it is the last one that was missing, to be `settle`d later.
@@ -90,59 +84,62 @@ class BacklogAssembly:
         Raises `WireError` where the chunk cannot be one.
         """
         _check(header, payload)
-        key = header.key
-        if self._done.get(key) == header.total_bytes:
+        key, total_bytes = header.key, header.total_bytes
+        if self._done.get(key) == total_bytes:
             self._done.move_to_end(key)
-            self._report(key, header.total_bytes)
+            self._unreported[key] = total_bytes
             return None
-        entry = self._entry(key, header.total_bytes)
-        if entry.handed:
-            self._report_busy(key, entry, header.total_bytes)
+        if key in self._handed:  # nothing is here of another object of the same name
+            self._unreported[key] = total_bytes - 1 if self._handed[key] == total_bytes else 0
             return None
-        fresh = payload[len(entry.data) - header.offset :] if header.offset <= len(entry.data) else b""
-        finishes = len(entry.data) + len(fresh) == header.total_bytes
+        known_bytes, data = self._open.pop(key, (total_bytes, bytearray()))
+        if known_bytes != total_bytes:
+            data = bytearray()
+        self._open[key] = total_bytes, data
+        fresh = payload[len(data) - header.offset :] if header.offset <= len(data) else b""
+        finishes = len(data) + len(fresh) == total_bytes
         if fresh and (may_finish or not finishes) and self._make_space(key, len(fresh)):
-            entry.data += fresh
-        if len(entry.data) == header.total_bytes:
-            entry.handed, whole = True, bytes(entry.data)
-            entry.data = bytearray()
-            self._report_busy(key, entry, header.total_bytes)
-            return whole
-        self._report(key, len(entry.data))
-        if not entry.data:
+            data += fresh
+        whole = len(data) == total_bytes
+        self._unreported[key] = len(data) - whole
+        if whole or not data:
             del self._open[key]
-        return None
+        if not whole:
+            return None
+        self._handed[key] = total_bytes
+        return bytes(data)
 
     def settle(self, key: ObjectKey, *, usable: bool | None) -> None:
         """Report the outcome of an object that was handed out: it is in its place, or unusable.
 
         None forgets one that cannot be taken: another ground may, or this one later.
         """
-        entry = self._open.get(key)
-        if entry is None or not entry.handed:
+        total_bytes = self._handed.pop(key, None)
+        if total_bytes is None:
             return
-        del self._open[key]
         if usable is None:
             self._unreported.pop(key, None)
             return
-        times = 0 if usable else self._refusals.pop(key, 0) + 1
-        if usable or times >= _PATIENCE:
-            self._finish(key, entry.total_bytes)
+        refusals = 0 if usable else self._refusals.pop(key, 0) + 1
+        if 0 < refusals < _PATIENCE:
+            self._refusals[key] = refusals
+            self._unreported[key] = 0
             return
-        self._refusals[key] = times
-        self._report(key, 0)
+        self._refusals.pop(key, None)
+        if key[1] != BacklogKind.INFO:  # one that was forgotten here has to come through again
+            self._done.put(key, total_bytes)
+        self._unreported[key] = total_bytes
 
     def drop_handed(self) -> int:
         """Forget objects that were handed out to somebody who is gone: the edge sends them again. How many."""
-        handed = [key for key, entry in self._open.items() if entry.handed]
-        for key in handed:
-            del self._open[key]
-            self._report(key, 0)
-        return len(handed)
+        dropped, self._handed = self._handed, {}
+        for key in dropped:
+            self._unreported[key] = 0
+        return len(dropped)
 
     def want_info(self, session_id: int) -> None:
         """Ask for the facts of a session: without them nothing can be made of its objects."""
-        self._report((session_id, BacklogKind.INFO, 0), 0)
+        self._unreported[session_id, BacklogKind.INFO, 0] = 0
 
     @property
     def unreported(self) -> int:
@@ -159,35 +156,13 @@ class BacklogAssembly:
             for (session_id, kind, number), acknowledged_range in taken
         )
 
-    def _entry(self, key: ObjectKey, total_bytes: int) -> _Open:
-        # The object's entry, now the newest; a new one where there is none or it was of another size.
-        entry = self._open.get(key)
-        if entry is None or (entry.total_bytes != total_bytes and not entry.handed):
-            entry = self._open[key] = _Open(total_bytes)
-        self._open.move_to_end(key)
-        return entry
-
     def _make_space(self, key: ObjectKey, more_bytes: int) -> bool:
-        while len(self._open) > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
-            victim = next((one for one, entry in self._open.items() if one != key and not entry.handed), None)
+        while self.in_progress > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
+            victim = next((one for one in self._open if one != key), None)
             if victim is None:
                 return False
             del self._open[victim]
         return True
-
-    def _finish(self, key: ObjectKey, total_bytes: int) -> None:
-        self._refusals.pop(key, None)
-        if key[1] != BacklogKind.INFO:  # one that was forgotten here has to come through again
-            self._done[key] = total_bytes
-            self._done.move_to_end(key)
-        self._report(key, total_bytes)
-
-    def _report_busy(self, key: ObjectKey, entry: _Open, total_bytes: int) -> None:
-        # Report the object as busy: nothing is here of another object of the same name.
-        self._report(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
-
-    def _report(self, key: ObjectKey, acknowledged_bytes: int) -> None:
-        self._unreported[key] = acknowledged_bytes
 
 
 def backlog_content(key: ObjectKey, data: bytes, *, edge: str) -> BacklogContent:

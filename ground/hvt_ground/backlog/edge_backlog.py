@@ -60,8 +60,6 @@ class EdgeBacklog:
         self._assembly = BacklogAssembly()
         self._lock = threading.Lock()
         self._infos: Newest[int, Info] = Newest(_MOST_INFOS)
-        self.working = 0
-        """Received objects that are not delivered yet."""
         self._sessions = 0
         """Sessions that have ended: jobs still at work for one of them are ignored."""
 
@@ -69,6 +67,11 @@ class EdgeBacklog:
     def paths(self) -> Sequence[Path]:
         """Recordings of former sessions that were written."""
         return () if self._recordings is None else tuple(self._recordings.paths)
+
+    @property
+    def working(self) -> int:
+        """Received objects that are not delivered yet."""
+        return self._assembly.handed
 
     @property
     def unreported(self) -> int:
@@ -108,7 +111,6 @@ class EdgeBacklog:
         with self._lock:
             self._infos.put(info.session_id, info)
             dropped = self._assembly.drop_handed()
-            self.working = 0
             self._sessions += 1
         if dropped:
             _log.info("%s: %d objects of an outage were not worked off in time", self._edge, dropped)
@@ -136,9 +138,7 @@ class EdgeBacklog:
         else:
             assert self._recordings is not None, "without, no chunk of another session is taken"
             take = partial(self._recordings.using, self._infos[key[0]])
-        with self._lock:
-            self.working += 1
-            done = partial(self._done, key, self._sessions)
+        done = partial(self._done, key, self._sessions)
         if isinstance(content, ReceivedStill):
             worker.submit(read_still(content, take, done=done))
         else:
@@ -147,10 +147,8 @@ class EdgeBacklog:
     def _done(self, key: ObjectKey, session: int, usable: bool | None) -> None:  # noqa: FBT001 - partial
         # A job has ended; None: its object was not taken.
         with self._lock:
-            if session != self._sessions:
-                return
-            self.working -= 1
-            self._assembly.settle(key, usable=usable)
+            if session == self._sessions:
+                self._assembly.settle(key, usable=usable)
 
 
 class BacklogRecording:
