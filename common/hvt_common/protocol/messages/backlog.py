@@ -58,21 +58,12 @@ _KIND = OneOf(tuple(BacklogKind))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BacklogHeader(Message):
-    """Attachment of ``backlog``; the payload is one chunk of the object."""
-
-    MAX_BYTES: ClassVar[int] = 80
-
+class _OfObject:
     session_id: int = wire_field(Int(0, U64))
     """In which it was captured: the current one, or one of an earlier start of the edge."""
     kind: str = wire_field(_KIND)
     """A `BacklogKind`."""
     number: int = wire_field(Int(0, U32))
-    offset: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
-    """Where the chunk begins in the object, bytes."""
-    total_bytes: int = wire_field(_SIZE)
-    send_ns: int = wire_field(Int(0, I63))
-    """When the chunk was handed to Zenoh, the edge's clock."""
 
     @property
     def key(self) -> ObjectKey:
@@ -80,18 +71,24 @@ class BacklogHeader(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AcknowledgedRange:
+class BacklogHeader(_OfObject, Message):
+    """Attachment of ``backlog``; the payload is one chunk of the object."""
+
+    MAX_BYTES: ClassVar[int] = 80
+
+    offset: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
+    """Where the chunk begins in the object, bytes."""
+    total_bytes: int = wire_field(_SIZE)
+    send_ns: int = wire_field(Int(0, I63))
+    """When the chunk was handed to Zenoh, the edge's clock."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcknowledgedRange(_OfObject):
     """The bytes of an object that a ground holds, contiguous from its beginning."""
 
-    session_id: int = wire_field(Int(0, U64))
-    kind: str = wire_field(_KIND)
-    number: int = wire_field(Int(0, U32))
     acknowledged_bytes: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
     """The whole object: the edge may delete it. Less than before: send again from there."""
-
-    @property
-    def key(self) -> ObjectKey:
-        return self.session_id, self.kind, self.number
 
 
 @dataclass(frozen=True, slots=True)
