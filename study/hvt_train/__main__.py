@@ -8,12 +8,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvt_common.errors import UserError, exit_with_sentence, needs_extra
+from hvt_common.errors import UserError, exit_with_sentence, needs_extra, telling
+from hvt_common.files import MOST_TABLE_BYTES, read_text
 from hvt_common.inference.runtimes.model_file import check_onnx_file
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models
 from hvt_common.runtime.process import interrupt_on_signals
+from hvt_common.runtime.reporting import check_writable
 
 _PROGRAM = "python -m hvt_train"
 
@@ -26,6 +28,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments = _parser().parse_args(argv)
+    for name in ("seeds", "every", "threads"):
+        if getattr(arguments, name, 1) < 1:
+            raise UserError(f"--{name} is {getattr(arguments, name)}, must be at least 1")
     return {"eval": _evaluate, "curve": _curve, "join": _join}.get(arguments.command, _train)(arguments)
 
 
@@ -98,9 +103,14 @@ def _curve(arguments: argparse.Namespace) -> int:
         import matplotlib as mpl  # noqa: PLC0415
         from matplotlib.figure import Figure  # noqa: PLC0415
 
-    if not arguments.log.is_file():
-        raise UserError(f"{arguments.log} does not exist; the log of a training run is expected")
-    rows = [json.loads(line) for line in arguments.log.read_text(encoding="utf-8").splitlines()]
+    with telling(f"--out {arguments.out} cannot be made (", "): name a file"):
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(arguments.out, name="--out", reads=[arguments.log])
+    with telling(f"{arguments.log} cannot be read (", "): the log of a training run is expected"):
+        lines = read_text(arguments.log, most=MOST_TABLE_BYTES).splitlines()
+    rows = [_row(arguments.log, *numbered) for numbered in enumerate(lines, 1)]
+    if not any("loss" in row for row in rows):
+        raise UserError(f"{arguments.log} has no loss: the log of a training run is expected")
     figure = Figure(figsize=(7.2, 3), layout="constrained")
     left = figure.subplots()
     right = left.twinx()
@@ -116,10 +126,19 @@ def _curve(arguments: argparse.Namespace) -> int:
     right.set_ylim(0, 1)
     left.set_xlabel("steps")
     left.set_title(arguments.title)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context({"svg.hashsalt": arguments.title}):
         figure.savefig(arguments.out, format="svg", metadata={"Date": None})
     return 0
+
+
+def _row(log: Path, number: int, line: str) -> dict[str, float]:
+    try:
+        row = json.loads(line)
+        return {
+            name: float(row[name]) for name in ("step", "loss", "validation") if name in row or name == "step"
+        }
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise UserError(f'{log}, line {number} is {line[:60]!r}; accepted is {{"step": 50, …}}') from None
 
 
 def _train(arguments: argparse.Namespace) -> int:

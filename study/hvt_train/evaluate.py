@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -136,12 +137,15 @@ def average_precision(scores: npt.NDArray[np.float32], hits: npt.NDArray[np.bool
 
 def clip_frames(clip: Path, *, every: int) -> Iterator[Image]:
     """Every n-th frame of a clip, whole in a 1280x720 picture as the base letterboxes it."""
-    with av.open(str(clip)) as container:
-        for index, frame in enumerate(container.decode(video=0)):
-            if index % every == 0:
-                image = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
-                fitted = Resizer((frame.width, frame.height), BASE_SIZE, fit="letterbox")
-                yield fitted.frame(image, index=index, capture_ns=0).base_bgr
+    try:
+        with av.open(str(clip)) as container:
+            for index, frame in enumerate(container.decode(video=0)):
+                if index % every == 0:
+                    image = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+                    fitted = Resizer((frame.width, frame.height), BASE_SIZE, fit="letterbox")
+                    yield fitted.frame(image, index=index, capture_ns=0).base_bgr
+    except (av.error.FFmpegError, IndexError) as error:
+        raise UserError(f"{clip} is not a video that can be read ({error}); give another") from None
 
 
 def reference_vehicles(reference: Path, frames: Sequence[Image], *, confidence: float = 0.4) -> list[Boxes]:
@@ -177,7 +181,7 @@ def evaluate_real(detector: Detector, frames: Sequence[Image], truth: Sequence[B
             if best >= 0 and table[row, best] >= 0.5:
                 hits, table[:, best] = hits + 1, 0
         found, total = found + len(boxes), total + len(wanted)
-    return RealResult(hits / max(total, 1), hits / max(found, 1), total, len(frames))
+    return RealResult(hits / max(total, 1), hits / found if found else math.nan, total, len(frames))
 
 
 EVALUATION_FIRST = 200
@@ -231,9 +235,13 @@ def print_real(detector: Path, clip: Path, reference: Path, *, every: int) -> No
     """Recall and precision of vehicles against the reference's boxes on the same untouched frames."""
     for path in (clip, reference):
         if not path.is_file():
-            raise UserError(f"{path} does not exist; a file is expected")
+            raise UserError(
+                f"{path} {'is no file' if path.exists() else 'does not exist'}; a file is expected"
+            )
     frames = list(clip_frames(clip, every=every))
     truth = reference_vehicles(reference, frames)
+    if not any(map(len, truth)):
+        raise UserError(f"{reference} sees no vehicle in {clip}: there is nothing to measure by")
     for size in _SIZES:
         for confidence in _CONFIDENCES:
             result = evaluate_real(

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from hvt_train.__main__ import main
 from hvt_train.evaluate import average_precision, evaluate_drawn, evaluate_real
 from hvt_train.pictures.fleet import make_solid
 from hvt_train.pictures.places import Picture, draw_place
@@ -133,6 +134,32 @@ def test_degrading_keeps_the_size_and_changes_the_picture():
 
 
 # --- measuring -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("curve torn --out a.svg", """torn, line 2 is '{"step":'; accepted is {"step": 50, …}"""),
+        ("curve stray --out a.svg", "stray, line 1 is '3'; accepted is"),
+        ("curve empty --out a.svg", "empty has no loss"),
+        ("curve good --out good", "--out good is good itself, which is read"),
+        ("curve good --out good/a.svg", "--out good/a.svg cannot be made (File exists)"),
+        ("eval --real . --reference good", ". is no file"),
+        ("eval --real good --reference good", "good is not a video that can be read"),
+        ("eval --drawn --seeds 0", "--seeds is 0, must be at least 1"),
+        ("eval --real good --reference good --every 0", "--every is 0, must be at least 1"),
+    ],
+)
+def test_what_cannot_be_drawn_or_measured_is_said(tmp_path, monkeypatch, capsys, words, said):
+    """They ended in tracebacks, in nan, or in a picture of nothing."""
+    monkeypatch.chdir(tmp_path)
+    good = '{"step": 1, "loss": 2}\n'
+    for name, text in (("torn", good + '{"step":'), ("stray", "3"), ("empty", ""), ("good", good)):
+        (tmp_path / name).write_text(text)
+    assert main(words.split()) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "a.svg").exists()
+    assert (tmp_path / "good").read_text() == good
 
 
 class Fixed:
