@@ -25,8 +25,8 @@ from hvt_study.commands.arguments import (
 )
 from hvt_study.commands.output import (
     RunProgress,
+    check_out,
     decimals,
-    make_out,
     print_columns,
     print_lines,
     share,
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_means(arguments)
     plan = _plan(arguments)
     folder: Path = arguments.out
-    file = make_out(folder, name="compare.json")
+    file = check_out(folder, name="compare.json")
     opened, jobs = open_pool(arguments)
     with RunProgress("flights") as progress, opened as pool:
         result = compare(plan, pool=pool, workers=jobs, on_flights=progress.update)

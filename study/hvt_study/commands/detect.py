@@ -25,7 +25,7 @@ from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import check_whole, names_of, option
-from hvt_study.commands.output import RunProgress, decimals, make_out, print_columns, writing
+from hvt_study.commands.output import RunProgress, check_out, decimals, print_columns, writing
 from hvt_study.datasets.class_map import VEHICLE, VEHICLES
 from hvt_study.datasets.label_files import read_image
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures
@@ -159,9 +159,10 @@ def _detect(arguments: argparse.Namespace) -> int:
     reads = [*arguments.pictures, *(one.path for one in pictures)]
     for written in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
         check_not_read(arguments.out / written, reads, name="--out")
-        make_out(arguments.out, name=written)
+        check_out(arguments.out, name=written)
     shown, frames, seen = [], [], 0
-    with (arguments.out / "detections.csv").open("w", encoding="utf-8", newline="") as file:
+    found_in = arguments.out / "detections.csv"
+    with writing(arguments.out), found_in.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
         for picture, image, labels in readable(pictures, "pictures"):

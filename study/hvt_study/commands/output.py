@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from hvt_common.errors import FlightError, UserError
+from hvt_common.errors import FlightError, UserError, telling
 from hvt_common.runtime.reporting import check_writable
 
 _WIDTH = 100
@@ -70,20 +70,23 @@ def share(value: float | None, digits: int = 3) -> str:
     return decimals(value, digits).replace("0.", ".", 1)
 
 
-def make_out(folder: Path, *, name: str) -> Path:
-    """The file of that name in ``--out``, which is made; `UserError` now where it could not be written later."""
-    try:
+def check_out(folder: Path, *, name: str) -> Path:
+    """The file of that name in ``--out``; `UserError` now where it could not be written later. Leaves nothing."""
+    with telling(f"--out {folder} cannot be made (", "): name a folder"):
+        fresh = [one for one in (folder, *folder.parents) if not one.exists()]
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--out {folder} cannot be made ({error.strerror}): name a folder") from None
     check_writable(folder / name, name="--out")
+    with suppress(OSError):  # another study writes there
+        for one in fresh:
+            one.rmdir()
     return folder / name
 
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Within it, a failed write is a `UserError` that names ``--out``."""
+    """Make ``--out``; within it, a failed write is a `UserError` that names it."""
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         yield
     except (OSError, FlightError) as error:
         cause = error if isinstance(error, OSError) else error.__cause__

@@ -16,8 +16,8 @@ from hvt_common.values import Image
 from hvt_study.commands.arguments import base_size, check_means, flown_frames, option, parse_rates
 from hvt_study.commands.output import (
     RunProgress,
+    check_out,
     decimals,
-    make_out,
     print_columns,
     print_lines,
     share,
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Fly, read, print the table, write it and a sheet of examples."""
     check_means(arguments)
     plan = _plan(arguments)
-    file = make_out(arguments.out, name="read.json")
+    file = check_out(arguments.out, name="read.json")
     with RunProgress("flights") as progress:
         result = compare_codes(plan, on_flight=progress.update)
     if not result.rows:

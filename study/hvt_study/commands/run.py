@@ -17,7 +17,7 @@ from hvt_study.commands.arguments import (
     option,
     study_plan,
 )
-from hvt_study.commands.output import RunProgress, make_out
+from hvt_study.commands.output import RunProgress, check_out, writing
 from hvt_study.matrix.plan import RunRow, StudyPlan, check_parameters, first_runs, in_order, run_all, staying
 from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.table_file import RESULTS, read_results, write_results
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     plan = study_plan(arguments, open_sequences(arguments))
-    table = make_out(arguments.out, name=RESULTS)
+    table = check_out(arguments.out, name=RESULTS)
     check_parameters(plan, _earlier(table), out=arguments.out)
     rows = _flown(plan, arguments, table)
     others = _write(rows, arguments, table)
@@ -78,7 +78,8 @@ def _earlier(table: Path) -> list[RunRow]:
 def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> int:
     """Write them, and behind them the remaining rows of the present table; returns the number of those."""
     others = staying(rows, _earlier(table))
-    write_results(in_accounting([*rows, *others], arguments.accounting), table)
+    with writing(arguments.out):
+        write_results(in_accounting([*rows, *others], arguments.accounting), table)
     return len(others)
 
 

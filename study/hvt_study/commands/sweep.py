@@ -23,7 +23,7 @@ from hvt_edge.source.opening import Source, open_source
 from hvt_edge.source.video import VideoSource
 from hvt_edge.stills.policy.selectors import SELECTORS, select
 from hvt_study.commands.arguments import check_whole, option
-from hvt_study.commands.output import make_out, print_columns, writing
+from hvt_study.commands.output import check_out, print_columns, writing
 
 COLUMNS = ("policy", "selected", "ratio", "frame_coverage")
 _INPUT_COLUMNS = ("frame", "x1", "y1", "x2", "y2", "conf", "class")
@@ -199,7 +199,7 @@ def _own_rate(path: Path) -> float:
 
 
 def _write(rows: Sequence[SweepRow], folder: Path) -> None:
-    path = make_out(folder, name="sweep.csv")
+    path = check_out(folder, name="sweep.csv")
     with writing(folder), path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)

@@ -24,7 +24,7 @@ from hvt_study.commands.arguments import (
     open_sequences,
     study_plan,
 )
-from hvt_study.commands.output import RunProgress, make_out, print_columns, print_lines, writing
+from hvt_study.commands.output import RunProgress, check_out, print_columns, print_lines, writing
 from hvt_study.matrix.plan import StudyPlan, spec_of
 from hvt_study.matrix.tuning import tuning_texts
 from hvt_study.report.data.arms import picture_of
@@ -222,7 +222,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"--still-codecs {arguments.still_codecs} are several: parameters are searched for one, name it"
         )
     train, held_out = split(plan.sequences, held_out=arguments.held_out)
-    written = make_out(arguments.out, name="tune.json")
+    written = check_out(arguments.out, name="tune.json")
     pool, _ = open_pool(arguments)
     progress = RunProgress(f"{arguments.method}, trials")
 

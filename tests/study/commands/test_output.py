@@ -9,7 +9,8 @@ from collections import deque
 
 import pytest
 
-from hvt_study.commands.output import RunProgress, time_left_s
+from hvt_common.errors import UserError
+from hvt_study.commands.output import RunProgress, check_out, time_left_s, writing
 from programs.processes import eventually
 
 
@@ -54,3 +55,16 @@ def test_near_the_end_no_seconds_are_told(capsys, left_s, says):
     with RunProgress("flights", first_line_s=60) as flights:
         flights.update(6, 7, left_s)
     assert capsys.readouterr().err.endswith(f", {says} left\n")
+
+
+def test_a_refused_command_leaves_no_folder(tmp_path):
+    """Each mistyped call left an empty one."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for folder in (mine, tmp_path / "a" / "b"):
+        assert check_out(folder, name="t.json") == folder / "t.json"
+    assert [*tmp_path.iterdir()] == [mine]
+    with writing(tmp_path / "a" / "b"):
+        (tmp_path / "a" / "b" / "t.json").write_text("")
+    with pytest.raises(UserError, match="File name too long"):
+        check_out(tmp_path / ("x" * 300), name="t.json")
