@@ -23,7 +23,9 @@ _log = logging.getLogger(__name__)
 LAST_FRAME = 10_000_000
 """Over 90 hours at 30 fps; a higher frame number is a mistake."""
 LARGEST = 1e9
-"""Beyond it no pixel and no id lies; ids stay exact in floats."""
+"""Beyond it no pixel lies."""
+_LARGEST_ID = 2.0**53
+"""Below it ids are exact in floats."""
 _SHOWN_CHARS = 60
 
 
@@ -89,9 +91,13 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_d
     names = tuple(columns.split(","))
     lines = tuple(line for _, line in numbered)
     count = max(least, min(len(names), usual_cells(lines)))
-    wanted = f"finite numbers {','.join(names[:least])}" + (",…" if len(names) > least else "")
+    wanted = f"numbers below {LARGEST:g} {','.join(names[:least])}" + (",…" if len(names) > least else "")
     table = _numbers(lines, count)
-    good = np.asarray((np.abs(table) < LARGEST).all(axis=1), np.bool_)  # false for NaN
+    limits = [_LARGEST_ID if name == "id" else LARGEST for name in names[:count]]
+    good = np.asarray((np.abs(table) < limits).all(axis=1), np.bool_)  # false for NaN
+    if of_dataset and "w" in names:
+        wanted += ", w and h from 0 on,"
+        good &= (table[:, names.index("w") : names.index("h") + 1] >= 0).all(axis=1)
     if frames:
         wanted += f" with a whole frame number from 0 to {LAST_FRAME}"
         with np.errstate(invalid="ignore"):
