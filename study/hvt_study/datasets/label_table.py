@@ -53,6 +53,8 @@ class LabelTable:
     """Index into ``class_names``."""
     class_names: tuple[str, ...]
     ignored: Regions
+    paired: bool = False
+    """Of `FrameLabels`."""
 
     @classmethod
     def of(
@@ -107,6 +109,7 @@ class LabelTable:
             class_names=tuple(self.class_names[kind] for kind in self.class_ids[rows].tolist()),
             ignored_xyxy_px=regions[land],
             beside_xyxy_px=regions[~land],
+            paired=self.paired,
         )
 
 

@@ -43,6 +43,8 @@ class FrameLabels:
     beside_xyxy_px: Boxes = field(default_factory=no_boxes)
     """(P, 4) float32: single objects that are not judged. Boxes on them count neither for nor against; labels in
     front of them are labels."""
+    paired: bool = False
+    """A box is on such an object only as its match, one to one, as in TrackEval; else with half of its area."""
 
     @classmethod
     def plain(

@@ -150,6 +150,10 @@ def _judgeable(boxes: Boxes, labels: FrameLabels, *, there: Boxes) -> npt.NDArra
     outside = _outside(boxes, labels.ignored_xyxy_px)
     if not len(labels.beside_xyxy_px):
         return outside
+    if labels.paired:
+        pairs = matched_rows(np.concatenate((there, labels.beside_xyxy_px)), boxes)
+        outside[pairs[pairs[:, 0] >= len(there), 1]] = False
+        return outside
     free = _outside(boxes, np.concatenate((labels.ignored_xyxy_px, labels.beside_xyxy_px)))
     on = iou(boxes, there).max(axis=1, initial=0) >= LEAST_IOU
     return np.asarray(outside & (free | on))

@@ -11,9 +11,9 @@ ROOT may be one sequence, or hold them below train/ and test/. CVAT's "MOT 1.1" 
 then given with ``?fps=``. Pixels count from 1.
 
 Which boxes count goes by TrackEval (https://github.com/JonathonLuiten/TrackEval, ``mot_challenge_2d_box.py``): in the
-published sequences boxes on distractors, static persons, reflections and persons on vehicles (crowds, too, and on
-MOT20 other vehicles) count neither for nor against, and anything else that is marked as not counting is nothing at
-all. Where a file names its own classes, rows marked so are passed over. MOT15 has no classes: all are pedestrians,
+published sequences boxes that match distractors, static persons, reflections and persons on vehicles (on MOT20 other
+vehicles, too) count neither for nor against, and anything else that is marked as not counting is nothing at all.
+Where a file names its own classes, rows marked so are passed over. MOT15 has no classes: all are pedestrians,
 and in place of class and visibility there is a place in the world, or -1,-1,-1.
 """
 
@@ -48,8 +48,8 @@ _LEAST_VISIBLE = 0.5
 _LAYOUT = "NAME/seqinfo.ini, NAME/img1/000001.jpg and NAME/gt/gt.txt"
 _NAMES = ("pedestrian", "person on vehicle", "car", "bicycle", "motor", "non-motorised vehicle")
 """MOT17's classes from 1 on that may be objects."""
-_BESIDE = (2, 7, 8, 12, 13)
-"""Person on vehicle, static person, distractor, reflection, crowd."""
+_BESIDE = (2, 7, 8, 12)
+"""Person on vehicle, static person, distractor, reflection."""
 _BESIDE_ON_MOT20 = (*_BESIDE, 6)
 """Its cyclists and the like are labelled as non-motorised vehicles."""
 _HIGHEST = 13
@@ -92,7 +92,8 @@ def mot_table(
         class_names = tuple(class_names[kind - 1] for kind in used.tolist())
         kinds = np.searchsorted(used, kinds) + 1
     ignored = Regions.of(rows, passed, np.zeros(len(rows), np.bool_), origin=1.0)
-    return LabelTable.of(rows, judged, kinds - 1, class_names, ignored=ignored, size=size, origin=1.0)
+    table = LabelTable.of(rows, judged, kinds - 1, class_names, ignored=ignored, size=size, origin=1.0)
+    return replace(table, paired=not own)
 
 
 @dataclass(frozen=True, slots=True)
