@@ -6,6 +6,7 @@ import argparse
 import csv
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,11 +129,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Detect on all pictures; write detections.csv, and score.json and two sheets where there are labels."""
-    with writing(arguments.out):
-        return _detect(arguments)
+    with ExitStack() as written:
+        return _detect(arguments, written)
 
 
-def _detect(arguments: argparse.Namespace) -> int:
+def _detect(arguments: argparse.Namespace, written: ExitStack) -> int:
     size = parse_size(arguments.size, name="--size")
     confidence = arguments.confidence
     if confidence is None:
@@ -157,12 +158,12 @@ def _detect(arguments: argparse.Namespace) -> int:
     word: _Word = as_one if arguments.vehicles_as_one else kind_of
     classes = _counted(pictures, names_of(arguments.labelled), word)
     reads = [*arguments.pictures, *(one.path for one in pictures)]
-    for written in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
-        check_not_read(arguments.out / written, reads, name="--out")
-        check_out(arguments.out, name=written)
+    for name in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
+        check_not_read(arguments.out / name, reads, name="--out")
+        check_out(arguments.out, name=name)
+    written.enter_context(writing(arguments.out))
     shown, frames, seen = [], [], 0
-    found_in = arguments.out / "detections.csv"
-    with writing(arguments.out), found_in.open("w", encoding="utf-8", newline="") as file:
+    with (arguments.out / "detections.csv").open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
         for picture, image, labels in readable(pictures, "pictures"):

@@ -38,7 +38,14 @@ def answer(found: Sequence[Setting]) -> Iterator[str | Drawing]:
     """Against plain video at the same bits; of the first setting in a figure, too."""
     metric = METRICS[DECIDES]
     for setting in found:
-        plain = [pair for pair in pairs(setting, references=("M0",)) if pair.gaps(DECIDES)]
+        every = list(pairs(setting, references=("M0",)))
+        plain = [pair for pair in every if pair.gaps(DECIDES)]
+        if len(plain) < len(every):
+            alone = ", ".join(f"{one.arm.name}, {one.arm.regime}" for one in every if one not in plain)
+            yield (
+                f"{setting.name}, labels: {setting.labels}. No {metric.title} of video at the same bits stands "
+                f"beside {alone}: of these there is no answer."
+            )
         if not plain:
             continue
         best = max(plain, key=lambda pair: pair.interval(DECIDES).mean)

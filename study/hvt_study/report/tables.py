@@ -204,12 +204,13 @@ def differences_table(setting: Setting, found: Sequence[Pair]) -> Table | None:
         *(Head(f"Δ {one.title}", says=definition(one, setting.accounting)) for one in metrics),
         Head("ahead", says=f"sequences with more {METRICS[_DECIDES].title}, with less"),
     )
-    off = max(pair.most_off_pct() for pair in found)
+    off = max((pair.most_off_pct() for pair in found if pair.names), default=None)
+    apart = "No pair counts" if off is None else f"The totals of no pair are more than {off:.2f} % apart"
     caption = (
         f"Paired differences at matched totals, {setting.name}: method less video-only method on the same sequence, "
         f"mean; beneath, the {INTERVALS}, and n where fewer than the row's have the figure. Bold where the interval "
-        f"leaves out 0. Ahead: sequences with more and with less {METRICS[_DECIDES].title}. The totals of no pair "
-        f"are more than {off:.2f} % apart. {under(setting)}"
+        f"leaves out 0. Ahead: sequences with more and with less {METRICS[_DECIDES].title}. {apart}. "
+        f"{under(setting)}"
     )
     return Table(caption, heads, rows, breaks)
 

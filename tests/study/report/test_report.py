@@ -185,6 +185,17 @@ def test_differences_are_of_pairs_at_matched_totals():
     assert not any(cell.strong for cell in column(table, "Δ named F1"))
 
 
+def test_where_video_misses_the_bits_of_a_method_there_is_no_answer():
+    """It was left out without a word, and "the totals of no pair are more than 0.00 % apart"."""
+    missed = [one | {"failed": "spends less"} if one["matched_to"] else one for one in study()]
+    first, *_ = make_report(missed).sections
+    (said,) = first.parts
+    assert first.title == "The answer"
+    assert str(said).endswith("beside M5 jpeg, low: of these there is no answer.")
+    (setting,) = settings(missed)
+    assert "No pair counts. " in differences_table(setting, list(pairs(setting))).caption
+
+
 def test_runs_of_other_networks_and_labels_are_never_averaged_together():
     """Reference labels say how much survives, annotations what is right: one mean of both says nothing."""
     rows = [

@@ -44,9 +44,9 @@ class Pair:
         return interval_of(self.gaps(column))
 
     def most_off_pct(self) -> float:
-        """The largest distance of two totals, in per cent of the arm's; 0 without pairs."""
+        """The largest distance of two totals, in per cent of the arm's."""
         ours, theirs = values(self.runs, "total_bps"), values(self.matched, "total_bps")
-        return max((100 * abs(theirs[name] / ours[name] - 1) for name in self.names), default=0.0)
+        return max(100 * abs(theirs[name] / ours[name] - 1) for name in self.names)
 
 
 def pairs(setting: Setting, *, references: tuple[str, ...] | None = None) -> Iterator[Pair]:
