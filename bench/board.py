@@ -36,7 +36,7 @@ _GROUPS = (
     (Path("/sys/fs/cgroup"), "cgroup.controllers", "cpu.max", f"{_QUOTA_US} {_PERIOD_US}"),
     (Path("/sys/fs/cgroup/cpu"), "cpu.cfs_quota_us", "cpu.cfs_quota_us", f"{_QUOTA_US}"),
 )
-"""Of version 2 and 1: where they are, a file that is there, and the text that a group writes into which file."""
+"""Cgroups of version 2 and 1: where they are, a file that is there, and which text goes into which file."""
 
 
 Hold = Callable[[str], object]

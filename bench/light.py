@@ -41,7 +41,7 @@ def _import_s(module: str) -> float:
 
 
 def _bare_s() -> float:
-    """Of one frame, in this process: reading the clip, then x265."""
+    """Processor time of one frame, in this process: reading the clip, then x265."""
     began_s = time.process_time()
     taken = frames(_FRAMES)
     read_s = time.process_time() - began_s
@@ -57,7 +57,7 @@ def _bare_s() -> float:
 
 
 def _frame_s(*settings: str) -> float:
-    """Of one frame of such a flight, without its start."""
+    """Processor time of one frame of such a flight, without its start."""
     start_s, all_s = (
         min(_edge_s(count, *settings) for _ in range(_ROUNDS)) for count in (_FIRST, _FIRST + _FRAMES)
     )
@@ -65,7 +65,7 @@ def _frame_s(*settings: str) -> float:
 
 
 def _edge_s(count: int, *settings: str) -> float:
-    """Of a flight of so many frames in lockstep."""
+    """Processor time of a flight of ``count`` frames in lockstep."""
     return _spent_s(
         *("-m", "hvt_edge.cli", "--source", str(clip()), "--pace", "lockstep", "--quiet", *settings),
         *("--size", "{}x{}".format(*SIZE), "--wait", "0s", "--max-frames", str(count)),

@@ -74,7 +74,7 @@ def _demo() -> list[_Peak]:
 
 
 def _clip(*settings: str) -> _Peak:
-    """Of an edge to which nobody listens."""
+    """The peak of an edge to which nobody listens."""
     nobody = ("--wait", "0s", "--connect", free_endpoint(), "--quiet")
     with running("hvt_edge.cli", "--source", clip(), *nobody, *settings) as edge:
         peaks = Peaks([edge])
@@ -83,7 +83,7 @@ def _clip(*settings: str) -> _Peak:
 
 
 def _played(count: int) -> _Peak:
-    """Of a ground that so many edges send to."""
+    """The peak of a ground that ``count`` edges send to."""
     endpoint = free_endpoint()
     # Two seconds.
     units = coded(

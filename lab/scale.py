@@ -34,7 +34,7 @@ from lab.link.carriers.star import Star
 _ROUTER = Path(__file__).resolve().parents[1] / "deploy" / "router.py"
 _FLEETS = ((6, 3), (60, 6), (1000, 40))
 _MOST_SESSIONS = 20
-"""Of the edges; further ones share them."""
+"""Sessions of the edges; further ones share them."""
 _QUIET_S = 12.0
 _POLL_S = 0.25
 

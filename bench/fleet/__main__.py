@@ -37,7 +37,7 @@ class Served(NamedTuple):
 
     edges: int
     tracked_fps: float
-    """Of all edges together."""
+    """Frames of all edges together that are tracked in a second."""
     cores: float
     passed_over: tuple[float, float]
     """Share of frames, at the best and the worst served edge."""

@@ -94,7 +94,7 @@ _STILL_SHIFT: Final = 0.03
 _STILL_CHANGED: Final = 0.006
 _CHANGED_LEVELS: Final = 16
 _BLUR_PX: Final = 5
-"""Of the reduced picture; noise and the coding of a base stream are not motion."""
+"""In the reduced picture; noise and the coding of a base stream are not motion."""
 
 
 class CameraMotion:

@@ -30,12 +30,12 @@ _INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NO_MORE = (errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _NO_MORE_WORDS = ("can't start new thread", "failed to map segment from shared object")
-"""Of Python's errors without a number."""
+"""Words of Python's errors without a number."""
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 def foreign() -> type[BaseException]:
-    """What foreign code may raise, for an ``except``: much of it calls `sys.exit`, or panics in Rust. Not Ctrl-C."""
+    """Exceptions of foreign code, for an ``except``: much of it calls `sys.exit`, or panics in Rust. Not Ctrl-C."""
     return Exception if isinstance(sys.exc_info()[1], KeyboardInterrupt | GeneratorExit) else BaseException
 
 

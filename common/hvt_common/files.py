@@ -16,7 +16,7 @@ from pathlib import Path
 
 MOST_BYTES = 16_000_000
 MOST_TABLE_BYTES = 1_000_000_000
-"""Of labels and annotations of a whole dataset."""
+"""Limit for labels and annotations of a whole dataset."""
 PIPE_WAIT_S = 10.0
 """The longest wait for a pipe's other end, and then for its content."""
 

@@ -131,9 +131,9 @@ class Pose:
     altitude_m: float | None = None
     """Above mean sea level."""
     camera: Orientation | None = None
-    """Of the optical axis."""
+    """Orientation of the optical axis."""
     platform: Orientation | None = None
-    """Of the aircraft or vehicle."""
+    """Orientation of the aircraft or vehicle."""
     hfov_deg: float | None = None
     """Horizontal field of view of the source frame, above 0 and below 180."""
     position_error_m: float = 3.0

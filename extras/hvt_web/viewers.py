@@ -19,7 +19,7 @@ from hvt_web.video.pictures import RUNGS, THUMBNAIL, Made, Rung
 
 _MOST_QUEUED = 400
 _MOST_QUEUED_BYTES = 4 * 2**20
-"""Of a viewer; above, it loses pictures up to the next keyframe. Its first messages do not count."""
+"""A viewer's limit: above, it loses pictures up to the next keyframe. Its first messages do not count."""
 _MOST_TEXTS = 2000
 _MOST_TEXT_BYTES = 4 * 2**20
 """Text is not dropped: a viewer with more of it unread is given up."""
@@ -54,7 +54,7 @@ class Viewer:
         self.hopeless = False
         """It takes nothing at all any more: nothing is kept for it, and `take` raises."""
         self.reason = ""
-        """Of its end, in words for the page; at most 120 bytes."""
+        """Reason of its end, in words for the page; at most 120 bytes."""
         self._queue: deque[tuple[str | bytes, bool]] = deque()
         self._bytes = 0
         self._texts = self._text_bytes = 0

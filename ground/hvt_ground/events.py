@@ -197,13 +197,13 @@ class Refinement(Shown):
     unread: bool = False
     """Nothing could read it: both classes are the edge's word."""
     note: str = ""
-    """Of an unread still: the classifier's name for it, which no track can have."""
+    """The classifier's name for an unread still, which no track can have."""
     doubted: bool = False
     """The still says that the object is nothing of mine."""
     sure: bool = False
     """``class_after`` has a calibrated probability above .9."""
     vague: tuple[bool, bool] = (False, False)
-    """Of the class before and after, as `Overlay.vague`."""
+    """`Overlay.vague` for the class before and for the class after."""
     header: RoiHeader | None = None
     """The still's own message, in source pixels; None where nobody has it."""
 

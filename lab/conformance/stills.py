@@ -172,7 +172,7 @@ def _vector(
 
 
 def _noise_planes() -> tuple[Planar, Planar, Planar]:
-    """Of a base picture: every level beside every other, and one half of it black and white."""
+    """Planes of a base picture: every level beside every other, and one half of it black and white."""
     rng, (width, height) = np.random.default_rng(11), _BASE
     luma = rng.integers(0, 256, (height, width), np.uint8)
     blue, red = (rng.integers(0, 256, (height // 2, width // 2), np.uint8) for _ in range(2))
@@ -181,7 +181,7 @@ def _noise_planes() -> tuple[Planar, Planar, Planar]:
 
 
 def _base_planes() -> tuple[Planar, Planar, Planar]:
-    """Of a base picture: limited range, with blacks and whites beyond it, as a decoder may give."""
+    """Planes of a base picture: limited range, with blacks and whites beyond it, as a decoder may give."""
     width, height = _BASE
     luma = _texture(width, height, seed=1)[..., 0]
     first, second = (_texture(width // 2, height // 2, seed=seed)[..., 0] for seed in (4, 5))

@@ -33,7 +33,7 @@ class Target:
     """From the real encoders."""
     mutate: Mutator = raw_bytes
     share: int = 10
-    """Of the inputs of a run over all targets."""
+    """Weight in the inputs of a run over all targets."""
     short: int = 2000
     """Inputs in the normal tests: at least a hundred, in some tenths of a second where that can be."""
     most_bytes: int = 4096

@@ -13,7 +13,7 @@ _Change = Callable[[bytes, Random, Bytes], bytes]
 
 
 def inside(name: str) -> Mutator:
-    """Of the payload behind the first byte, which says the size; now and then of any byte at all."""
+    """A mutator of the payload behind the first byte, which says the size; now and then of any byte at all."""
     change = _CHANGES.get(name)
 
     def mutated(data: bytes, rng: Random, raw: Bytes) -> bytes:

@@ -45,7 +45,7 @@ class _Progress:
     target: str
     inputs: int = 0
     seconds: float = 0.0
-    """Of the processor, as in ``slowest_ms``: the machine may have other work."""
+    """Seconds of processor, as in ``slowest_ms``: the machine may have other work."""
     slowest_ms: float = 0.0
     rss_kb: list[tuple[int, int]] = field(default_factory=list)
     """(inputs so far, resident memory)."""

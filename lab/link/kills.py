@@ -43,7 +43,7 @@ FPS = 10
 EDGE = f"--source-fps {FPS} --fps {FPS} --size 320x180 --preset ultrafast --detector motion --budget 400kbps".split()
 GROUND = ("--detector", "motion", "--classifier", "none")
 FRAMES = 180
-"""Of the scene: longer than any trial."""
+"""Frames of the scene: longer than any trial."""
 _SCRIPT = Path(__file__).with_name("kills.toml")
 _FLIGHT_S = (0.1, 7.5)
 _ENDING_S = (0.0, 0.25)

@@ -37,7 +37,7 @@ class Scenario:
     name: str
     about: str
     budget: str
-    """Of the edge, as its ``--budget`` takes it."""
+    """Budget of the edge, as its ``--budget`` takes it."""
     bars: Mapping[str, str]
     """The bars of measures: ``{"decodable frames, %": ">= 97"}``."""
     transport: Transport

@@ -46,7 +46,7 @@ class CodeInView:
 
     @property
     def height_px(self) -> float:
-        """Of the characters, source pixels."""
+        """Height of the characters, source pixels."""
         return float(np.linalg.norm(self.corners_source_px[3] - self.corners_source_px[0]))
 
     @property

@@ -30,7 +30,7 @@ from hvt_train.pictures.real import HeldOut
 from hvt_train.pictures.views import ViewSettings
 
 _CODED_SHARE = 0.65
-"""Of the pictures go through x265, as a detector on a thin base meets them. The others stay as they are."""
+"""Share of the pictures that go through x265, as a detector on a thin base meets them. The others stay unchanged."""
 _PLAUSIBLE = (0.1, 10.0)
 """Slopes of a calibration; another one comes of too few boxes."""
 _STEPS_BETWEEN = 5
@@ -53,7 +53,7 @@ class FineTuneSettings:
     """Measurements without a better one after which it ends."""
     batch: int = 8
     side: int = 320
-    """Of a view, pixels; a multiple of 32."""
+    """Side of a view, pixels; a multiple of 32."""
     rate: float = 1e-3
     seed: int = 1
     threads: int = 2

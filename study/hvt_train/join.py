@@ -30,7 +30,7 @@ PREFIX = "street_"
 
 _OWN = "own_output"
 _STRIDES = (16, 32, 64)
-"""Of its cells, pixels of the whole picture: 8, 16 and 32 of its input."""
+"""Strides of its cells, pixels of the whole picture: 8, 16 and 32 of its input."""
 _THEIR_CONFIDENCE = 0.3
 _COCO_OF = {
     **{name: name for name in ("car", "truck", "bus", "bicycle")},

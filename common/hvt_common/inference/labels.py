@@ -27,7 +27,7 @@ KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": V
 
 _NO_COCO_ID = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
 _FIRST_COCO_ID = {"tf-lists": 1, "labels-boxes-scores": 0, "ssd": 0}
-"""Of heads that list objects by COCO's own ids, as TensorFlow, torchvision and the Open Model Zoo do."""
+"""Heads that list objects by COCO's own ids, as TensorFlow, torchvision and the Open Model Zoo do."""
 _BACKGROUND = ("background", "???", "n/a")
 _FIRST_COCO_ID_OF = {90: 1, 91: 0}
 """By the number of classes."""

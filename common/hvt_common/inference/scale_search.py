@@ -26,7 +26,7 @@ from hvt_common.values import Detections, Image
 _log = logging.getLogger(__name__)
 _GRID: Final = (2, 2)
 _OVERLAP: Final = 0.05
-"""Of two neighbouring parts: objects in enlarged parts are small."""
+"""Share that two neighbouring parts overlap: objects in enlarged parts are small."""
 _MOST_SIDE: Final = 1280
 """A larger picture is searched at the scale of its pixels already (`hvt_common.inference.tiles`)."""
 _FIRST, _APART, _EVERY = 3, 3, 45
@@ -50,7 +50,7 @@ _RARER: Final = 3
 
 
 class ScaleSearch:
-    """Of one video, whose detector's scores are probabilities; for one thread.
+    """Finds the scale of one video, whose detector's scores are probabilities; for one thread.
 
     ``detect`` runs the detector on a picture of any size, None while it fails. Boxes from ``confidence`` on count.
     """

@@ -53,7 +53,7 @@ _LARGE_PX: Final = 24
 """… and the least side of a large object in it. With 32 a tenth of thermal cars is missed."""
 _SURE: Final = 0.5
 _PART: Final = 0.02
-"""Of a vehicle's box; a person seen from above is a thirtieth."""
+"""Share of a vehicle's box; a person seen from above is a thirtieth of it."""
 _ACROSS: Final = 0.7
 """Two partial boxes are of one object if they share this much of the longer one's extent along the cut side."""
 

@@ -33,7 +33,7 @@ def trust_from(detector: str) -> float | None:
 
 
 class ViewTrust:
-    """Of one video. Boxes count from a confidence of ``counts_from``; None trusts every view.
+    """Trust in the detector on one video. Boxes count from a confidence of ``counts_from``; None trusts every view.
 
     ``unlike`` holds while the detector does not know the view; that is said once, with the consequence ``hence``.
     ``mean`` is the mean confidence of the boxes that count, None before there were enough. From any thread.

@@ -28,7 +28,7 @@ class Account(Enum):
 
 
 _MOST_REASONS = 23
-"""Of one outcome, each by its own name; a status carries one more."""
+"""Reasons of one outcome that are counted by name; a status carries one more."""
 MOST_WINDOW_NS = 60_000_000_000
 """The longest window, which an edge may name."""
 _MOST_PENDING = _MOST_IN_WINDOW = 65_536
@@ -58,7 +58,7 @@ _BATCH_BYTES = 16384
 """`session` sets this size; a longer message crosses in fragments with a header each."""
 _FRAGMENT_BYTES = 9
 _SEGMENT_PAYLOAD_BYTES = 1448
-"""Of TCP with timestamps over IPv4 on a link with an MTU of 1500."""
+"""Payload of TCP with timestamps over IPv4 on a link with an MTU of 1500."""
 _SEGMENT_HEADER_BYTES = 52
 
 

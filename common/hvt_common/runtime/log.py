@@ -21,7 +21,7 @@ from hvt_common.units import shown_text
 
 LOG_FORMATS = ("text", "json")
 STATUS_LOGGER = "hvt.status"
-"""Of the lines that are a status line else; in JSON only."""
+"""Logger of lines that go to the status line in text form, and to the log in JSON alone."""
 
 START_LOGGER = "hvt.start"
 """Findings at the start that are no warning; not with ``quiet``."""

@@ -48,7 +48,7 @@ _LONGEST_S: Final = 10.0
 _LEAST_DETECTIONS: Final = 3
 """Detections that a lost track is remembered for, where they are further apart than the buffer is long."""
 _MOST_SHIFT: Final = 0.1
-"""Of the picture's sides, since the last update: the new part of the view has no tracks (`CameraMotion.shift`)."""
+"""Share of the picture's sides that may come into view between updates: it has no tracks (`CameraMotion.shift`)."""
 
 _OLD_S: Final = 1.5
 _OLD_GAPS: Final = 2

@@ -20,7 +20,7 @@ _WINDOW_PX: Final = 9
 _LEVELS: Final = 2
 _AROUND_PX: Final = 64
 _ALIGNED: Final = 2**_LEVELS
-"""Of a part of the pictures: wider than the windows of the smallest level, whose pixels are those of the whole."""
+"""A part begins at a multiple of this: then its pixels of the smallest level are those of the whole picture."""
 _LEAST_AGREEING: Final = 5
 _MOST_APART_PX: Final = 1.5
 _MOST_APART: Final = 0.15
@@ -29,7 +29,7 @@ _MOST_CHANGED: Final = 30.0
 """Levels: a point that looks so different shows something else."""
 _MOST_SCALE: Final = 1.1
 _LEAST_PX: Final = 10.0
-"""Of the shorter side in the pictures: the windows around smaller objects mostly see the ground."""
+"""Least shorter side in the pictures: the windows around smaller objects mostly see the ground."""
 
 _across = (np.arange(_SIDE) + 0.5) / _SIDE * _MIDDLE + (1 - _MIDDLE) / 2
 _GRID: Final = np.stack(np.meshgrid(_across, _across), axis=-1).reshape(1, _POINTS, 2)

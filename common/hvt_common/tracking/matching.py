@@ -20,7 +20,7 @@ _WEAK_COST_LIMIT: Final = 0.5
 _UNCONFIRMED_COST_LIMIT: Final = 0.7
 _DUPLICATE_COST_LIMIT: Final = 0.15
 _MOST_APART: Final = 0.2
-"""Of the longer side of a duplicate's box: 0.15 / 0.85 and a little more."""
+"""Share of the longer side of a duplicate's box: 0.15 / 0.85 and a little more."""
 
 _AS_PREDICTED_IOU: Final = 0.5
 _MOST_SURPRISES: Final = 0.1

@@ -16,7 +16,7 @@ from hvt_common.values import Image
 _MOST_GROWN: Final = 1.6
 """Times the height that was seen: then it is the road that is followed."""
 _FLOW_WEIGHT: Final = 0.5
-"""Of the motion seen against the velocity before it."""
+"""Weight of the motion seen against the velocity before it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ _DEFAULTS: Mapping[str, Any] = {
 }
 
 _PRIORITIES = ("1-3", "4-7")
-"""Of two links to one place: answers, status and reports on the first, pictures, stills and tracks on the second."""
+"""Two links to one place: answers, status and reports take the first, pictures, stills and tracks the second."""
 
 _CLIENT: Mapping[str, Any] = {
     "mode": "client",
@@ -209,7 +209,7 @@ _ENDPOINT = re.compile(
 )
 _SCOPE = re.compile(r"(\[fe[89ab][^%\]]*)%(?!\d+\])([^\]]+)(\][^#]*)#?", re.IGNORECASE)
 _IFACE = re.compile(r"(\[fe[89ab][^%\]]*)(\][^#]*)#(?:.*;)?iface=([^;]+).*", re.IGNORECASE)
-"""Of ``[fe80::1%eth0]`` Zenoh knows numbers alone, which change with the interface; here it knows names."""
+"""In ``[fe80::1%eth0]`` Zenoh takes numbers alone, which change with the interface; as ``iface`` it takes names."""
 
 
 def _check_endpoints(side: str, endpoints: tuple[str, ...]) -> None:

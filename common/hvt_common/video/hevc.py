@@ -36,7 +36,7 @@ _BLOCK_PX = 64
 """A coded picture is filled up to whole blocks, and libavcodec's rows to as much."""
 _YUV420 = ("yuv420p", "yuvj420p")
 _FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)
-"""Of the luma of ITU-T H.273, 16 to 235."""
+"""Levels 0 to 255 for the luma of ITU-T H.273, 16 to 235."""
 Plane = npt.NDArray[np.uint8]
 
 

@@ -61,7 +61,7 @@ class Plan:
     detect_s: float = 0.0
     compare_s: float = 0.0
     detector_share: float = 1.0
-    """Of the sides of the detector's input."""
+    """Share of its sides that the detector's input keeps."""
 
 
 def most_cores(processors: float, *, others: float = 0.0) -> float:
@@ -132,7 +132,7 @@ class CpuBudget:
         self.reduces = True
         """Whether the detector's input may be reduced now."""
         self.detector_share = 1.0
-        """Of the sides of the detector's input, for the detection that was admitted last."""
+        """Share of its sides that the detector's input keeps at the detection that was admitted last."""
         self.queued = 0
         """Frames behind the one in hand."""
         self.keyframe_soon = False

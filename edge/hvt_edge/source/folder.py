@@ -32,7 +32,8 @@ _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
 def sequence_files(folder: Path) -> list[Path]:
     """The images of a folder in natural order (img2 before img10), without hidden files and subfolders.
 
-    Of names that are times 9.05 comes before 9.5; a TIFF is its only one. Raises `UserError` for what cannot be read.
+    Among names that are times 9.05 comes before 9.5. A TIFF counts as a folder of itself. Raises `UserError` for a
+    folder that cannot be read.
     """
     if is_tiff(str(folder)):
         return [folder]

@@ -38,7 +38,7 @@ COLUMNS = (
     *("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg", "yaw_deg", "pitch_deg", "roll_deg"),
     *("hfov_deg", "position_error_m", "height_error_m", "angle_error_deg"),
 )
-"""Of a table. One of the first two, latitude and longitude are needed; `Pose` and `Orientation` define each:
+"""Columns of a table. One of the first two, latitude and longitude are needed; `Pose` and `Orientation` define each:
 ``camera_…`` is where the optical axis points, the plain angles are the platform's."""
 _MOST_BYTES = 64_000_000
 _BOUNDS: Mapping[str, tuple[float, float]] = {

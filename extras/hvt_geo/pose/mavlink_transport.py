@@ -234,7 +234,7 @@ MAX_FRAME_BYTES = 280
 
 
 class FrameParser:
-    """Of a stream, whose frames may begin in one read and end in the next, or of datagrams, which may be cut alike.
+    """Parses a stream, whose frames may begin in one read and end in the next, or datagrams, which may be cut alike.
 
     The rest of the datagram before may be noise: it counts where more messages come out with it.
     """

@@ -112,8 +112,8 @@ class Receiver:
             RoiHeader: deque(maxlen=_MOST_HELD),
         }
         self._unseen: tuple[tuple[int, int], int, int] | None = None
-        """Of the first report since a picture came: its session and how many had come damaged, how many were sent by
-        then, and when it came."""
+        """The first report since a picture came: its session and how many pictures had come damaged, how many were
+        sent by then, and when the report came."""
         self._uptime = Uptime()
         self._captures = CaptureTimes()
         self._last_message_ns = time.monotonic_ns()

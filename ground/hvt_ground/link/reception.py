@@ -88,9 +88,9 @@ class Reception:
         self.ledger = Ledger(window_ns=info.window_ns)
         self.receive_latency, self.overlay_latency = LatencyStats(), LatencyStats()
         self.clock_offset = edge_clock
-        """Of the edge's clock."""
+        """The offset of the edge's clock."""
         self.capture_clock, self.pose_clock = CaptureClock(edge_clock), CaptureClock(edge_clock)
-        """Of the camera and of the source of poses."""
+        """The clocks of the camera and of the source of poses."""
         self.counters = StreamCounters()
         """Counts of the reassembly since the session before."""
         self.sequences = StillSequenceWindow()
@@ -118,7 +118,7 @@ class Reception:
         self._next_traffic_ns = 0
         self._traffic: Traffic | None = None
         self._lock = threading.Lock()
-        """Of all below."""
+        """Guards all that is below."""
         self._base_sequence = self._still_sequence = self._last_still = -1
         self._missing_base: tuple[int, ...] = ()
         """Sequences that the newest units of ``base`` wait for."""
@@ -346,7 +346,7 @@ class Reception:
     # Reports
 
     def add_results(self, results: Iterable[StillResult]) -> None:
-        """Of stills that were read."""
+        """Count the results of stills that were read."""
         with self._lock:
             self._results.extend(results)
 

@@ -53,7 +53,7 @@ class _Evidence:
 
 
 class Guesses:
-    """Of one video, whose detector's scores are probabilities; ``scale`` is base pixels per source pixel.
+    """The guesses in one video, whose detector gives probabilities; ``scale`` is base pixels per source pixel.
 
     Frames rise; for one thread.
     """

@@ -67,7 +67,7 @@ class Detection:
 
 
 class DetectorThread:
-    """Of one detector. The thread ends when nobody holds this any more."""
+    """The thread of one detector. It ends when nobody holds this any more."""
 
     def __init__(self) -> None:
         self._queue: SimpleQueue[Detection | None] = SimpleQueue()

@@ -43,12 +43,12 @@ _PUT_OFF = 4
 """The longest pause between two detections, in usual pauses, where one is put off again and again."""
 
 _TURN_SHARE = 0.5
-"""Of the time to the next picture a list waits for the detector, which other sessions use too."""
+"""Share of the time to the next picture that a list waits for the detector, which other sessions use too."""
 _LATE_NS = SECOND_NS
 """The longest time that tracks are followed while the detector is busy; after that they are old."""
 
 _HISTORY_S = 3.0
-"""Of pictures that residual stills may build on."""
+"""Pictures of this time are kept, for residual stills build on them."""
 _REACH_S = 4.0
 """The same number of pictures of a stream that leaves out frames reaches back further, but an edge sends its stills
 again only within this time."""
@@ -81,18 +81,18 @@ class PipelineParts:
     reader: StillReader
     refiner: Refiner
     vocabulary: Vocabulary
-    """Of the reader and the unified names of the fused list."""
+    """The reader's class names, and the unified names of the fused list."""
     fusion: Fusion
     path: CameraPath
     """The one that ``fusion`` moves boxes by."""
     detector_thread: DetectorThread
-    """Of the sessions that share the detector."""
+    """Sessions that share the detector share it."""
     trust: ViewTrust
-    """Of the detector, in this session's video."""
+    """How far the detector can be trusted in this session's video."""
     guesses: Guesses | None = None
     """None where the detector's scores are no probabilities."""
     search: ScaleSearch | None = None
-    """Of the detector, in this session's video; None where its scale is given."""
+    """The search for the scale of this session's video; None where the scale is given."""
     turns: AbstractContextManager[None] = field(default_factory=nullcontext)
     """Around analysis and the reading of stills, which may hang."""
 
@@ -108,12 +108,12 @@ class PerceptionCounts:
     class_changes: int = 0
     """Stills after which the class that is shown was another."""
     doubted: int = 0
-    """Of the tracks that are shown, those that stills doubt."""
+    """Tracks that are shown and that stills doubt."""
     detections_run: int = 0
     steps_used: int = 0
     """Reports of the edge's tracks that were taken in."""
     history_bytes: int = 0
-    """Of the pictures that are remembered for stills."""
+    """Size of the pictures that are remembered for stills."""
     stills_pending: int = 0
     """For their base frame."""
     stills_dropped: Counter[str] = field(default_factory=Counter)

@@ -43,13 +43,13 @@ Emit = Callable[[Event], None]
 
 
 class SessionPerception:
-    """Of one session: `pipeline` for live messages, `track` and `read` for stored ones, in one thread."""
+    """Makes one session's `pipeline` for live messages; `track` and `read` take stored ones, in one thread."""
 
     def __init__(self, config: GroundConfig, models: Models, info: Info) -> None:
         self._config, self._models, self._info = config, models, info
         self._trust = ViewTrust(models.facts.trust_from, hence="are drawn thin and unnamed")
         self.tilt = ViewTilt(vague_kinds=config.detector == EMBEDDED_DETECTOR)
-        """Of the view."""
+        """Whether the view is steep or aslant."""
         self._detect_every = detect_every(config.detect_every, fps=info.fps)
         self._next_id = FIRST_TRACK_ID
 

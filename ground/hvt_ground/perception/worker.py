@@ -30,8 +30,8 @@ _OLDEST_S = 0.6
 """A frame that has waited for longer goes untracked, if there is a newer one: a ground of too many edges would show
 all of them ever later."""
 _STILLS_AT_ONCE = 16
-"""Of one frame. Between those of two frames come the pictures that have arrived: to read stills may take longer than
-the time between two pictures."""
+"""Stills of one frame that are read at once. Pictures that have arrived go between the stills of two frames, because
+reading may take longer than the time between two pictures."""
 _MOST_STILLS = 256
 _MOST_STILL_BYTES = 32 * 2**20
 _MOST_STEPS = 8
@@ -39,7 +39,7 @@ _MOST_STEPS = 8
 _MOST_POSES = 64
 _MOST_JOBS = 4096
 _MOST_LAST_JOBS = 8
-"""Of those that come last: each holds a stretch of video."""
+"""Limit for jobs of least priority: each holds a stretch of video."""
 _JOB_STEP_S = 0.1
 """On a machine that never comes to rest jobs still get one step in this time."""
 _STEP_LAG = 2
@@ -313,7 +313,7 @@ class LockstepWorker(_Worker):
         self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
         self._poses: deque[tuple[int, Callable[[], None]]] = deque(maxlen=_MOST_POSES)
         self._captures_ns: deque[int] = deque(maxlen=_STEP_LAG)
-        """Of the last pictures."""
+        """Capture times of the last pictures."""
         self._newest_frame = -1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-perception-{name}")
 

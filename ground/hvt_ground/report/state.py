@@ -40,7 +40,7 @@ class PoseState:
     height_m: float | None
     """Above the ground."""
     age_s: float
-    """Of the newest pose now, or in lockstep at the newest picture; 10 s before a picture it places nothing on it."""
+    """Age of the newest pose; in lockstep at the newest picture. A pose is used for pictures up to 10 s later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +209,7 @@ class EdgeState:
     sessions_ended: int
     session: SessionState | None
     failed: tuple[FailedPart, ...]
-    """Of this edge's reception."""
+    """The parts of this edge's reception that failed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +220,7 @@ class GroundState:
     """Unix time."""
     version: str
     schema_version: int
-    """Of the messages on the wire."""
+    """Version of the messages on the wire."""
     detector: str
     classifier: str
     loading: bool

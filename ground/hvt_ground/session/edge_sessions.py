@@ -97,7 +97,7 @@ class EdgeSessions:
         """When the edge said that the open session has ended."""
         self._ended_id: int | None = None
         self._lost_id: int | None = None
-        """Of a session that ended as its edge was gone: only its stored objects may still come."""
+        """The session that ended as its edge was gone: only its stored objects may still come."""
         self._backlog_ns: int | None = None
         """When the last chunk of it came that nothing has been said of."""
         self._next_clock_ns = 0

@@ -59,7 +59,7 @@ _MOST_BYTES = 32 * 2**20
 """Some minutes of a thin link, or some hundred large stills."""
 _SMALL_BYTES = 512
 _TRACK_BYTES = 64
-"""Of an overlay, each."""
+"""Size of each track of an overlay."""
 _POLL_S = 0.2
 _AT_ONCE = threading.Event()
 _AT_ONCE.set()

@@ -41,9 +41,9 @@ Protocol = Literal["tcp", "udp"]
 
 _MOST_CONNECTIONS = 32
 _SOCKET_BYTES = 8192
-"""Of the relay's own receiving sockets: bytes that wait do so where the sender notices it."""
+"""Buffer of the relay's own receiving sockets: bytes that wait do so where the sender notices it."""
 _FLIGHT_SEGMENTS = 256
-"""Of a connection: the receive window of the far end, 370 kB."""
+"""Most segments of a connection under way: the receive window of the far end, 370 kB."""
 _FLIGHT_DATAGRAMS = 4096
 _OUTLIVES_SCRIPT_S = 120.0
 _CLOSE_WAIT = 8

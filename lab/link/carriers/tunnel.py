@@ -117,7 +117,7 @@ class Flight:
         self._most = most
         self._heap: list[tuple[float, int, int, bytes]] = []
         self._number = 0
-        """Of two that arrive at one moment, the first sent comes first."""
+        """Orders packets that arrive at one moment: the first sent comes first."""
 
     def put(self, packet: bytes, *, to: int, arrives_s: float) -> bool:
         """Send it on its way; False where too many are."""

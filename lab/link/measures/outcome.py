@@ -22,7 +22,7 @@ _RESOURCES: Mapping[str, Callable[[Sample], float]] = {
     "threads": lambda sample: sample.threads,
 }
 KINDS = ("base", "roi", "tracks", "backlog-still", "backlog-base", "backlog-info")
-"""Of messages that the budget is for."""
+"""Kinds of messages that the budget is for."""
 STORED_FROM = 2**31
 """Number of the first still that was not sent but kept (`hvt_edge.stills.scheduler`)."""
 NOTHING_STORED = StoreLeft(0, 0)
@@ -41,14 +41,14 @@ WARM: Mapping[str, str] = {
     "edge, memory MB more at the end": "<= 128",
     "ground, memory MB more at the end": "<= 128",
 }
-"""Of runs that are not too short to say. The allocator goes on for two minutes; only a soak asks for flat."""
+"""Bars of runs that are long enough. The allocator goes on for two minutes; only a soak asks for flat."""
 SOAK: Mapping[str, str] = {
     "edge, memory slope MB/h": "<= 1",
     "ground, memory slope MB/h": "<= 1",
     "ledger difference, bytes": "== 0",
     "stills lost": "== 0",
 }
-"""Of a run of half an hour or more."""
+"""Bars of a run of half an hour or more."""
 
 _STORE = ("stills", "video_s", "evicted_stills", "evicted_segments", "unreadable", "given_up")
 _LIVE_S = 1.0

@@ -21,7 +21,7 @@ _LATE_S = 1.0
 _DELAYS_S = (0.02, 20.0)
 _MOST_POINTS = 4000
 _SAMPLES = 2000
-"""Of the link's rate: a step each, so that bursts of loss show in a minute and a long run stays drawable."""
+"""Steps of the link's rate that are drawn: bursts of loss show in a minute, and a long run stays drawable."""
 
 
 def draw(outcomes: Sequence[Outcome], path: Path) -> None:

@@ -84,7 +84,7 @@ class ResourceSampler:
 
 
 def slope_mb_per_hour(samples: list[Sample]) -> float | None:
-    """Of resident memory after the warm-up, by Theil and Sen; None of too few samples.
+    """Slope of resident memory after the warm-up, by Theil and Sen; None for too few samples.
 
     The median of the slopes between all pairs of points: memory taken for a moment (a recording that is
     compacted) or once (a library that loads late) does not bend it. Points are medians of equal parts of the time.

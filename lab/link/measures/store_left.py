@@ -18,9 +18,9 @@ class StoreLeft:
     objects: int
     """Stills and stretches of video."""
     unreadable: int
-    """Of them."""
+    """Those of them that cannot be read."""
     missing_s: float = 0.0
-    """Of a stretch: from the first frame that cannot be read to the end of the last one stored."""
+    """The time of a stretch from the first frame that cannot be read to the end of the last one stored."""
     stills: frozenset[int] = frozenset()
     """Their numbers."""
 

@@ -76,11 +76,11 @@ class RoofCode:
 
     text: str
     height_m: float
-    """Of its characters."""
+    """Height of its characters."""
     centre_m: tuple[float, float]
     """In body axes, nose to +x; the code is read along +x."""
     colours: tuple[Colour, Colour]
-    """Of characters and panel."""
+    """Colours of characters and panel."""
 
     @property
     def corners_m(self) -> Points:

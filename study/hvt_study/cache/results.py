@@ -31,13 +31,13 @@ _DIGITS = 16
 
 
 def flight_code() -> str:
-    """Of all code that decides a flight and its figures: edge and ground, the extras that matter, and the study."""
+    """Digest of all code that decides a flight and its figures: edge, ground, extras that matter, and the study."""
     return code_digest(*FLYING, without=_BESIDE)
 
 
 @cache
 def code_digest(*packages: str, without: tuple[str, ...] = ()) -> str:
-    """Of the Python files of these packages, as they are installed here; a process reads them once.
+    """Digest of the Python files of these packages, as they are installed here; a process reads them once.
 
     A checkout and a wheel with the same files have the same digest. ``without`` names folders that are passed over.
     """

@@ -190,7 +190,7 @@ _STALE_MS = 500
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Of one budget."""
+    """Verdict on one budget."""
 
     sentence: str
     command: str

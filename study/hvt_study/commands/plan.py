@@ -37,7 +37,7 @@ _DETECTION_BYTES = 4_096
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Of a whole study."""
+    """Estimate for a whole study."""
 
     sequences: int
     frames: int

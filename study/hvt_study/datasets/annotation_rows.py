@@ -118,7 +118,7 @@ def usual_cells(lines: Sequence[str]) -> int:
 
 
 def label_text(path: Path) -> str:
-    """Of a text file; `UserError` where it cannot be read."""
+    """Text of a file of labels; `UserError` where it cannot be read."""
     try:
         return read_text(path, most=MOST_TABLE_BYTES)
     except OSError as error:

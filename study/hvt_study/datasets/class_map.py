@@ -70,7 +70,7 @@ def of_kinds(names: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
 def _pair(
     models: list[str], classes: list[str], *, kind: str
 ) -> tuple[dict[str, tuple[str, ...]], dict[str, str]]:
-    """Of one kind: the dataset classes of each model class, and the word of every name."""
+    """For one kind: the dataset classes of each model class, and the word of every name."""
     if len(classes) > 1 and {_plain(name) for name in models} == {_plain(name) for name in classes}:
         named = {_plain(name): name for name in classes}
         spoken: dict[str, tuple[str, ...]] = {name: (named[_plain(name)],) for name in models}
@@ -126,7 +126,7 @@ def joint_classes(
 
 
 def _common_word(name: str, *maps: ClassMap) -> str:
-    """Of a class of the dataset: the word of its kind where one of the models knows no finer."""
+    """Word for a class of the dataset: that of its kind where one of the models knows no finer."""
     own = _plain(name)
     said = (one.words.get(name, own) for one in maps)
     return next((word for word in said if word != own), own)

@@ -209,7 +209,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _words(value: object) -> list[str]:
-    """Of a word or a list; none of anything else."""
+    """Words in a word or a list; none in anything else."""
     every = [value] if isinstance(value, str) else list(value) if isinstance(value, list | tuple) else []
     return [one for one in every if isinstance(one, str)]
 
@@ -305,7 +305,7 @@ _MOST_COLUMNS = 6
 """With a confidence, as trackers and annotators add it; more is a polygon."""
 _LEAST_POLYGON = 7
 _VISIBLE = 2
-"""Of a keypoint, the third of its numbers; no polygon's coordinate is so large."""
+"""Greatest third number of a keypoint; coordinates of polygons are larger."""
 _MOST_SHARE = 2.0
 """A number beyond is no share of a picture: the file counts in pixels."""
 

@@ -163,13 +163,13 @@ _REGION, _OTHERS = 0, 11
 
 
 def image_labels(path: Path, size: tuple[int, int]) -> FrameLabels:
-    """Of one image of this (width, height); wrong rows are left out. `UserError` where all are."""
+    """Labels of one image of this (width, height); wrong rows are left out. `UserError` where all are."""
     table = _table(read_rows(path, columns=_OBJECT, least=6, frames=False, of_dataset=True), size)
     return table.at(-1)  # the value of a column that the file does not have
 
 
 def video_table(path: Path, size: tuple[int, int]) -> LabelTable:
-    """Of one sequence of pictures of this (width, height); wrong rows are left out. `UserError` where all are."""
+    """Labels of pictures of this (width, height); wrong rows are left out. `UserError` where all are."""
     return _table(read_rows(path, columns=f"frame,id,{_OBJECT}", least=10, of_dataset=True), size)
 
 

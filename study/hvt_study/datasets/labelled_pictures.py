@@ -64,7 +64,7 @@ class LabelledPicture:
     class_names: Sequence[str]
     visdrone: bool = False
     one_target: bool = False
-    """Of a sequence that labels one object and nothing else that is in view: it can be found or missed, no more."""
+    """The sequence labels one object and nothing else that is in view: it can be found or missed, no more."""
     labelled_size: tuple[int, int] | None = None
     """(width, height) that the labels say the picture has."""
     keypoints: int = 0

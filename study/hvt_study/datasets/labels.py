@@ -17,7 +17,7 @@ _NOTICED_PX = 0.01
 IGNORED = frozenset({"difficult", "dontcare", "ignore", "ignored"})
 """Classes (any case) whose boxes count neither for nor against."""
 NO_ID = -1
-"""Of an object whose dataset knows no identities."""
+"""Identity of an object whose dataset knows none."""
 
 
 def no_boxes() -> Boxes:
@@ -95,7 +95,7 @@ class LabelDoubts:
         size: tuple[int, int],
         scale: tuple[float, float],
     ) -> FrameLabels:
-        """Of (class, x1 y1 x2 y2, place in words), times ``scale``, in a picture of this (width, height).
+        """From (class, x1 y1 x2 y2, place in words), times ``scale``, in a picture of this (width, height).
 
         Boxes are cut at the picture. Boxes without area inside, and repeated ones, are left out; boxes of
         `IGNORED` become regions.

@@ -46,7 +46,7 @@ class Clip:
     """Rate at which the images of a folder were taken, or one that overrides a video's time stamps; None: 15 for a
     folder, the video's own."""
     seed: int = 0
-    """Of the demo's scene, or of the way of the camera over a picture."""
+    """Seed of the demo's scene, or of the way of the camera over a picture."""
 
     def images(self) -> Generator[Image, None, None]:
         if self.pixels is None:
@@ -160,7 +160,7 @@ class Sequence:
 
     @property
     def duration_s(self) -> float:
-        """Of the whole sequence, however little of it is played."""
+        """Duration of the whole sequence, however little of it is played."""
         return self.frame_count / self.fps
 
     def source_frame(self, frame_index: int) -> int:
@@ -181,7 +181,7 @@ class Sequence:
 
 
 def shown_frame(frame_index: int, *, fps: float) -> int:
-    """Of source frames taken ``fps`` times a second, the latest at or before a frame of the clip, exactly."""
+    """The latest of source frames taken ``fps`` times a second at or before a frame of the clip, exactly."""
     return int(frame_index * exact_rate(fps) / exact_rate(NOMINAL_FPS))
 
 

@@ -59,7 +59,7 @@ class _Way:
     """How a camera flies."""
 
     heading: tuple[float, float] = (-1.0, 0.0)
-    """Of length 1, to the picture's right and towards its bottom."""
+    """Direction of length 1, to the picture's right and towards its bottom."""
     climb: float = 0.08
     """By how much the window grows and shrinks again."""
     climb_s: float = 8.0
@@ -132,9 +132,9 @@ class VirtualCamera:
     annotated: bool = True
     """False: the annotations are not looked at."""
     classes: tuple[str, ...] = ()
-    """Of YOLO's labels; none: those of ``classes.txt``."""
+    """Classes of YOLO's labels; none: those of ``classes.txt``."""
     annotations: FrameLabels | None = field(init=False)
-    """Of the picture and of all its mirror images that may come into view, in pixels of the picture."""
+    """Labels of the picture and of all its mirror images that may come into view, in pixels of the picture."""
     class_set: tuple[str, ...] = field(init=False, default=())
     """All classes that the annotations may use, sorted."""
     size: tuple[int, int] = field(init=False)

@@ -95,7 +95,7 @@ def _stills(path: Path) -> list[FlownStill]:
 
 
 _SOME_PICTURES = 6
-"""Of the base stream in which a code is read, spread over the time that it is whole in view: reading takes time."""
+"""Base pictures in which a code is read, spread over the time that it is whole in view: reading takes time."""
 _CONTEXT = 1.2
 """Around a code where somebody looks at it, in its longer sides."""
 

@@ -21,7 +21,7 @@ _Colour = tuple[int, int, int]
 
 _PANEL_PX = (640, 360)
 _SHOWN_SHARE = 0.5
-"""Of width and height around the middle: a whole picture so small would be all boxes."""
+"""Share of width and height around the middle: a whole picture so small would be all boxes."""
 _PAIR_PX = (154, 154)
 _GAP_PX = 8
 _HEAD_PX, _LEGEND_PX, _TEXT_PX = 34, 34, 30
@@ -33,7 +33,7 @@ _WRONG: _Colour = (0, 94, 213)
 _MISSED: _Colour = (66, 228, 240)
 _LIGHT: _Colour = (255, 255, 255)
 _LEVELS = 16
-"""Of each colour of the pictures: the file stays small."""
+"""Levels of each colour of the pictures: the file stays small."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,7 +83,7 @@ class FlightReport:
     edge_cpu_ms: float
     """CPU of the edge's stages a frame, whatever the number of cores."""
     digest: str
-    """Of all payloads: two flights that sent the same have the same."""
+    """Digest of all payloads: two flights that sent the same have the same."""
     back_bytes: int = 0
     """Line bytes from the ground to the edge: reports on stills. The questions of a server are in ``line_bytes``."""
 
@@ -106,7 +106,7 @@ def coded_frames(frames: int, fps: float) -> frozenset[int]:
 
 
 def picture_age_p95_ms(shown_ns: Sequence[tuple[int, int]], frames: int) -> float:
-    """Of (arrival, capture) of every picture, seen at each of so many frames from the first picture on."""
+    """Age of the newest of the pictures, (arrival, capture), at each of ``frames`` from the first picture on."""
     shown = np.array(shown_ns, np.int64).reshape(-1, 2)
     at_ns = np.array([frame_ns(frame_index) for frame_index in range(frames)], np.int64)
     at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]

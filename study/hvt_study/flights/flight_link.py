@@ -230,7 +230,7 @@ class FlightOutlet:
 
     @property
     def digest(self) -> str:
-        """Of all that was sent but status: equal flights have the same."""
+        """Digest of all that was sent but status: equal flights have the same."""
         return self._digest.hexdigest()
 
     def _enter_ns(self, channel: Channel, payload: bytes, attachment: bytes) -> int:

@@ -60,7 +60,7 @@ class ClassCounts:
 
 @dataclass(frozen=True, slots=True)
 class ClassScore:
-    """Of one sequence, for the names before or after refinement."""
+    """Score of one sequence, for the names before or after refinement."""
 
     counts: ClassCounts
     boxes: int
@@ -179,7 +179,7 @@ def _codes(names: Sequence[str], code_of: dict[str, int]) -> _Codes:
 
 @dataclass(frozen=True, slots=True)
 class FirstCorrect:
-    """Of the true tracks of one sequence."""
+    """First correct names of the true tracks of one sequence."""
 
     waits_s: npt.NDArray[np.float64]
     """(N,) from the first frame's capture until the first list with the right class is shown, or the last list where

@@ -39,7 +39,7 @@ class AveragePrecision:
 
 @dataclass(frozen=True, slots=True)
 class DetectionScore:
-    """Of one sequence."""
+    """Score of one sequence."""
 
     mean: AveragePrecision
     """Over the classes that have labels."""
@@ -105,7 +105,7 @@ def _dataset(category: Mapping[str, int], frames: Sequence[_Frame]) -> dict[str,
 
 
 def _mean(precision: _Precision) -> AveragePrecision:
-    """Of (IoUs, recalls, …), over classes with labels."""
+    """Mean of (IoUs, recalls, …), over classes with labels."""
     return AveragePrecision(_known_mean(precision[0]), _known_mean(precision))
 
 

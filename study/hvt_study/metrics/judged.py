@@ -82,7 +82,7 @@ def rows_of(names: Sequence[str], chosen: Rows) -> tuple[str, ...]:
 LabelledFrame: TypeAlias = tuple[FrameLabels, FrameView]
 
 LabelledFrames: TypeAlias = Sequence[LabelledFrame]
-"""Of one sequence, in order; it may be empty."""
+"""Frames of one sequence, in order; it may be empty."""
 
 
 LEAST_IOU = 0.5

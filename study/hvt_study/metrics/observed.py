@@ -36,7 +36,7 @@ class StillArrival:
     """One still at the ground. Times are media time, from the first frame's capture."""
 
     sequence: int
-    """Of the edge; names the still."""
+    """The edge's sequence number; it names the still."""
     capture_s: float
     """Capture of the frame that it was cut from."""
     sent_s: float
@@ -70,11 +70,11 @@ class RefinedObject:
     """Shown for the track until then."""
     name_after: str
     area_share: float
-    """Of the object's box, of the base frame's area, 0…1."""
+    """Area of the object's box as a share of the base frame's, 0…1."""
     base: Opinion | None = None
-    """Of the object as the decoded base shows it; None where that was not asked or gave no answer."""
+    """Opinion on the object as the decoded base shows it; None where that was not asked or gave no answer."""
     still: Opinion | None = None
-    """Of the object as the still shows it, by the same model."""
+    """Opinion on the object as the still shows it, by the same model."""
 
 
 def still_delays_ms(stills: Sequence[StillArrival]) -> tuple[float, float]:

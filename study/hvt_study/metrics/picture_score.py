@@ -65,7 +65,7 @@ def right_boxes(
 
 
 def operating_point(frames: Sequence[Judged], *, name: str) -> OperatingPoint:
-    """Of one class, over pictures that hold only boxes at or above the confidence of use."""
+    """The operating point of one class, over pictures that hold only boxes at or above the confidence of use."""
     right = sum(len(right_boxes(frame, classes=[name])[0]) for frame in frames)
     boxes = sum(frame.view.class_names.count(name) for frame in frames)
     return OperatingPoint(right, boxes, sum(frame.class_names.count(name) for frame in frames))

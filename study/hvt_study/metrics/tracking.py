@@ -202,7 +202,7 @@ def _judge() -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Continuity:
-    """Of the labelled objects of one sequence."""
+    """Continuity of the labelled objects of one sequence."""
 
     objects: int
     found_share: float

@@ -57,7 +57,7 @@ class _Held:
     capture_ns: int
     picture_bgr: Image
     found: Detections
-    """Of the first pass; of both once the second has come."""
+    """Detections of the first pass; of both once the second has come."""
     blocks: Blocks
     whole: bool = False
 
@@ -79,7 +79,7 @@ class DdsGround:
     started_ns: int
     lists: dict[int, ObservedFrame] = field(default_factory=dict)
     delays_ns: list[int] = field(default_factory=list)
-    """Of every coded frame, in order: capture to the arrival that finished it."""
+    """Delay of every coded frame, in order: capture to the arrival that finished it."""
     shown_ns: list[tuple[int, int]] = field(default_factory=list)
     """(arrival, capture) of every picture of the first pass."""
     requests: deque[tuple[int, bytes]] = field(default_factory=deque)
@@ -133,7 +133,7 @@ class DdsGround:
             next(iter(self._held.values())).whole = True
 
     def _request(self, frames: tuple[int, ...]) -> None:
-        """Of a whole segment at once, as DDS does."""
+        """Request regions of a whole segment at once, as DDS does."""
         segment = [self._held[frame_index] for frame_index in frames]
         if self.settings.steady:
             every = np.logical_or.reduce([one.blocks for one in segment])

@@ -59,7 +59,7 @@ class Line:
 
     @property
     def digest(self) -> str:
-        """Of all payloads so far."""
+        """Digest of all payloads so far."""
         return self._digest.hexdigest()
 
     @property

@@ -26,7 +26,7 @@ from hvt_study.datasets.sequence import NOMINAL_FPS
 RATES = (NOMINAL_FPS, 7.5, 5.0, 3.0, 2.0)
 """Those that the study's video-only methods choose from too."""
 _LEAST_BITS_PER_PX = 0.1
-"""Of the whole budget, for each frame: with less, both passes are too coarse (docs/design-notes/dds.md)."""
+"""Least bits of the whole budget for each frame: with less, both passes are too coarse (docs/design-notes/dds.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +34,13 @@ class DdsSettings:
     """Sizes are shares of the picture, thresholds are confidences and IoUs (0…1)."""
 
     share: float = 0.5
-    """Of the budget without requests that the first pass takes; the second has the rest."""
+    """Share of the budget without requests that the first pass takes; the second has the rest."""
     segment_s: float = 1.0
     """So much media time is asked about at once."""
     fps: float | None = None
     """Frames a second of both passes; None: the most of `RATES` that leaves each frame a tenth of a bit a pixel."""
     scale: float = 1.0
-    """Of the first pass: its width and height as shares of the base size. The second has all of it."""
+    """Width and height of the first pass as shares of the base size. The second has all of it."""
     low: float = 0.1
     """From here a result of the first pass is uncertain: DDS takes it from a region proposal network."""
     high: float = 0.4
@@ -61,7 +61,7 @@ class DdsSettings:
     nms_iou: float = 0.45
     """Results of both passes that overlap more are one."""
     camera_motion: Literal["off", "flow"] = "flow"
-    """Of the tracker, as at the ground that flies."""
+    """The tracker's camera motion, as at the ground that flies."""
     preset: str = "veryfast"
     bundle_bytes: int = 4000
     """Access units of the second pass share a message up to about so much: DDS sends a segment's as one file."""
@@ -87,7 +87,7 @@ class DdsSettings:
 
     @property
     def window_ns(self) -> int:
-        """Of the budget: a second, or long enough for two frames."""
+        """Window of the budget: a second, or long enough for two frames."""
         return round(1e9 * max(1.0, 2 / self.rate))
 
     @property
@@ -192,7 +192,7 @@ class RegionRequest:
 
     first_frame: int
     frames: tuple[Blocks, ...]
-    """Of every coded frame of the segment in order, 1 to 255; empty masks where nothing is asked."""
+    """Masks of every coded frame of the segment in order, 1 to 255; empty where nothing is asked."""
 
     def pack(self) -> bytes:
         stack = np.stack(self.frames)

@@ -79,7 +79,7 @@ class ReadRow:
         return [code for code, _ in self._pooled("base")]
 
     def score(self, channel: Channel, *, heights_px: tuple[float, float] = (0.0, 1e6)) -> ChannelScore:
-        """Of the codes of all scenes whose characters have such a height."""
+        """Score over the codes of all scenes whose characters have such a height."""
         low, high = heights_px
         chosen = [(code, one) for code, one in self._pooled(channel) if low <= code.height_px < high]
         return channel_score([code for code, _ in chosen], {code.object_id: one for code, one in chosen})
@@ -89,7 +89,7 @@ class ReadRow:
         return [self.score(channel, heights_px=edges) for edges in pairwise(_HEIGHT_EDGES_PX)]
 
     def mean(self, name: str) -> float:
-        """Of a figure of the flights."""
+        """Mean of a figure of the flights."""
         return float(sum(getattr(one.flight, name) for one in self.scenes) / len(self.scenes))
 
     def _pooled(self, channel: Channel) -> list[tuple[Code, Evidence]]:
@@ -194,7 +194,7 @@ def _flights(plan: ReadPlan, scene: str, readings: Readings) -> Iterator[tuple[i
 
 
 def _best(plan: ReadPlan, spec: RunSpec, readings: Readings, target_bps: int) -> ReadFlight | None:
-    """Of all sizes and frame rates the flight of which most is read, and of equal ones soonest."""
+    """The flight of all sizes and frame rates in which most is read, and among equal ones soonest."""
     flown = (
         readings.matched(replace(spec, size=size), target_bps=target_bps, fps=fps)
         for size in plan.sizes(readings.source_size)

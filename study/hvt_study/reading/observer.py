@@ -26,7 +26,7 @@ CHANNELS: tuple[Channel, ...] = ("base", "stills", "composite")
 """The pictures to read: base alone, stills alone, and stills laid over the base picture at the source's size."""
 
 _EVERY_FRAMES = 5
-"""Of base pictures one in so many frames is read: three a second, as an operator would look at most."""
+"""Every fifth base picture is read: three a second, as an operator would look at most."""
 _REMEMBERED = 45
 _MOST_PENDING = 64
 INSIDE_SHARE = 0.98
@@ -109,7 +109,7 @@ class CodeObserver:
         self._read("stills", codes, [code_crop(still.image_bgr, box.tolist()) for box in boxes], at_ns=at_ns)
 
     def _read_composite(self, still: DecodedStill, base_bgr: Image | None, *, at_ns: int) -> None:
-        """Of codes that the still shows at least a part of; elsewhere the composite is the base."""
+        """Read the codes that the still shows at least a part of; elsewhere the composite is the base."""
         codes = [code for code in self._unread("composite", still.frame_index) if _share(code, still) > 0]
         if base_bgr is None or not codes:
             return

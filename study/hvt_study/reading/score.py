@@ -141,12 +141,12 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class ChannelScore:
-    """Of one channel of one flight."""
+    """Score of one channel of one flight."""
 
     read: float | None
     """Share of the codes that were read right at least once; None where there are none."""
     median_s: float | None
-    """Of the time from coming into view to the first right reading, over all codes; None where under half were."""
+    """Median time from coming in view to the first right reading, over all codes; None where under half were read."""
     misread: float | None
     """Share that was never read right, and once wrong with confidence as a code of the same length."""
 

@@ -165,7 +165,7 @@ def matrix_table(setting: Setting, column: str) -> Table | None:
 
 
 def _best(figures: pd.DataFrame) -> list[tuple[str, str]]:
-    """Of one regime, a column a method: only means of the same sequences are held against each other."""
+    """The best of one regime, a column a method: only means of the same sequences are compared."""
     known = figures.dropna(axis="columns", how="all")
     alike: dict[tuple[bool, ...], list[tuple[str, str]]] = {}
     for name in known:
@@ -248,7 +248,7 @@ def equal_table(setting: Setting, found: Sequence[EqualQuality], *, column: str)
 
 
 def ratio(value: float) -> str:
-    """Of bits, in words where the curve ends."""
+    """A ratio of bits, in words where the curve ends."""
     if math.isnan(value):
         return NOTHING
     if math.isinf(value):

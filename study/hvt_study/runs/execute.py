@@ -124,7 +124,7 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
 
 
 def _halves(frames: Sequence[Judged]) -> dict[str, float]:
-    """Of the list in each half of the clip: a setting tuned on one half must hold in the other."""
+    """Scores of the list in each half of the clip: a setting tuned on one half must hold in the other."""
     middle = len(frames) // 2
     found: dict[str, float] = {}
     for half, part in enumerate((frames[:middle], frames[middle:]), start=1):

@@ -32,7 +32,7 @@ class Method:
     kind: Kind
     says: str
     flags: tuple[str, ...] = ()
-    """Of ``hvt-edge``, on top of clip, budget, detector, size and still codec."""
+    """Flags of ``hvt-edge``, on top of clip, budget, detector, size and still codec."""
     sends_stills: bool = False
     """Whether ``--still-codecs`` multiplies it."""
     fps_choices: tuple[float, ...] = ()

@@ -49,7 +49,7 @@ _SEQUENCES = 8
 
 @dataclass(frozen=True, slots=True)
 class Materials:
-    """Of one sequence, with the networks of its runs."""
+    """Materials of one sequence, with the networks of its runs."""
 
     sequence: Sequence
     """As far as it is played, with the labels of its dataset."""
@@ -93,7 +93,7 @@ def open_materials(spec: RunSpec, *, cache: Path) -> Materials:
 
 @lru_cache(maxsize=1)
 def software_versions() -> dict[str, str]:
-    """Of everything that may change a result; HVT's own code counts by its files, edited or not."""
+    """Versions of everything that may change a result; HVT's own code counts by its files, edited or not."""
     versions = {"hvt": __version__, "code": flight_code(), "python": platform.python_version()}
     libav = (f"{name} {'.'.join(map(str, one))}" for name, one in sorted(av.library_versions.items()))
     return {**versions, "machine": platform.machine(), **installed(_PACKAGES), "libav": " ".join(libav)}
@@ -131,7 +131,7 @@ def _classifier(spec: str, provider: str) -> Classifier | None:
 
 @lru_cache(maxsize=4)
 def model_digests(models: ModelChoice) -> dict[str, str]:
-    """Of all files of each network, by its role; a process reads them once."""
+    """Digest of all files of each network, by its role; a process reads them once."""
     named = {"detector": models.detector, "edge_detector": models.edge_detector}
     if models.classifier not in (DETECTOR, NONE):
         named["classifier"] = models.classifier
@@ -156,7 +156,7 @@ class RunContext(Materials):
     """Open for one process; flights take turns. Its sequence has the labels of the runs, and its pixels at hand."""
 
     labels: tuple[FrameLabels, ...]
-    """Of every frame, source pixels."""
+    """Labels of every frame, source pixels."""
     pictures: object
     """Keeps the pixels; they go with it."""
 

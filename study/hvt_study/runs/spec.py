@@ -134,7 +134,7 @@ class Column:
     name: str
     type: Type
     group: str
-    """Of metrics; empty for columns that no table of the report shows."""
+    """Group of metrics; empty for columns that no table of the report shows."""
     title: str
     style: Literal["", "share", "kbps", "count", "seconds", "ms", "bytes", "rate", "nats"]
     better: Literal["", "more", "less"]

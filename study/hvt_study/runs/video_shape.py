@@ -21,13 +21,13 @@ from hvt_study.runs.spec import MATCH_TOLERANCE
 
 _STEP = 1.01
 _CLOSE = 0.003
-"""Of the target on the grid: with half a step it stays within one per cent of the real one."""
+"""Tolerance of the target on the grid: with half a step it stays within one per cent of the real one."""
 SAME_TOTAL = 1e-4
-"""Of a total: rates that come back from another accounting are rounded."""
+"""Tolerance of a total: rates that come back from another accounting are rounded."""
 _TRIES, _MORE = 7, 9
-"""Of the secant, and then beside the best budget."""
+"""Tries of the secant, and then beside the best budget."""
 _ASIDE = 0.004
-"""Of a budget: so far beside the best one the next is tried, where the curve has a step or falls."""
+"""Share of a budget by which the next is tried beside the best one, where the curve has a step or falls."""
 _USUAL_RATIO = 0.85
 """The share of its budget that a video-only method spends."""
 
@@ -130,7 +130,7 @@ def competing_sizes(nominal: tuple[int, int], source: tuple[int, int]) -> tuple[
     ``nominal``, the run's own, is always one of them; the others have the source's aspect ratio.
     """
     pixels = {nominal: _area(size_within(source, nominal))}
-    """Of the source's picture, without borders, by size."""
+    """Pixels of the source's picture, without borders, by size."""
     whole = (source[0] // 2 * 2, source[1] // 2 * 2)
     largest = max(*pixels.values(), _area(whole))
     least = (1 - _ALIKE) * _area(size_within(source, _BOXES[0]))

@@ -29,7 +29,7 @@ _GROUPS = {
     "boat": "boat",
 }
 _SURE, _ALONE, _NAMED = 0.25, 0.42, 0.45
-"""Of two; of the best one alone; from which YOLOX-nano's kind holds."""
+"""Least confidence of two detectors; of the best one alone; from which YOLOX-nano's kind holds."""
 _SAME, _LEAST_PX = 0.45, 4.0
 _SAME_DOUBT = 0.3
 _AT_ONE_PLACE, _STANDS, _MOVES = 0.65, 0.25, 0.6

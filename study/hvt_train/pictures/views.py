@@ -70,7 +70,7 @@ class ViewSettings:
     """How often a view is put together of four or nine smaller ones: small objects stand among others."""
     least_visible: float = 0.3
     least_side_px: float = 4.0
-    """Of the longer side of a box, in pixels of the view."""
+    """Least longer side of a box, in pixels of the view."""
 
 
 class ViewSource:

@@ -62,7 +62,7 @@ class Head:
     why: str
     """The evidence for it, half a sentence."""
     shapes: tuple[tuple[int, ...], ...]
-    """Of ``outputs``, as they were tried; from picture to picture one axis may change, or nothing is left."""
+    """Shapes of ``outputs`` when they were tried; one axis may change with the picture, or be empty."""
 
     def decode(
         self, outputs: Sequence[npt.NDArray[Any]], *, confidence: float, input_size: tuple[int, int]

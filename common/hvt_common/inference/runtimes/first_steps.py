@@ -28,7 +28,7 @@ _NO_PIXELS = frozenset({"Shape", "ShapeOf"})
 _BYTE_SLOPE, _BYTE_MEAN = 0.05, 10.0
 """A smaller slope, or a larger mean, is for pixels of 0…255."""
 _IMAGENET_MEANS, _NEAR = (123.7, 116.4, 103.7), 3.0
-"""Of red, green, blue."""
+"""Means of red, green and blue; others this near are the same."""
 
 _IR_KINDS = {
     "Convert": "Cast",
@@ -49,7 +49,7 @@ class _Node:
     inputs: list[str] = field(default_factory=list)
     output: str = ""
     value: _Numbers | None = None
-    """Of a constant."""
+    """The value of a constant."""
 
 
 def own_steps(path: Path) -> OwnSteps:

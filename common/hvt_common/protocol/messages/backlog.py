@@ -31,7 +31,7 @@ from hvt_common.protocol.messages.fields import (
 )
 
 MAX_BACKLOG_BYTES = MAX_PAYLOAD_BYTES
-"""Of one object: ten seconds of video at 3 Mbps."""
+"""Limit of one object: ten seconds of video at 3 Mbps."""
 MAX_ACKNOWLEDGED_RANGES = 16
 _MAX_UNITS = 2400
 _MAX_HEADER_BYTES = 1024
@@ -98,7 +98,7 @@ class BacklogStill:
     attachment: bytes = wire_field(Blob(_MAX_HEADER_BYTES))
     """A `RoiHeader` with the flag `STORED`, with the checksum of ``payload``."""
     encoding: str = wire_field(Text(_MAX_ENCODING_BYTES))
-    """Of Zenoh: the media type."""
+    """Zenoh's encoding: the media type."""
     payload: bytes = wire_field(Blob(MAX_BACKLOG_BYTES, least=1))
 
 

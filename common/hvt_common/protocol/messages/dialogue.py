@@ -33,7 +33,7 @@ MAX_STILL_CODECS = 24
 """How many a ground names."""
 MAX_BASE_CODECS = 8
 BASE_CODEC = "h265"
-"""Of all that an edge of HVT sends on ``base``."""
+"""The codec of all that an edge of HVT sends on ``base``."""
 MAX_TRACKS_NOW = 64
 """How many tracks one answer lists: the most confident."""
 _COUNT = Int(0, 2**53 - 1)

@@ -27,9 +27,9 @@ from hvt_common.protocol.messages.fields import Kind, WireError
 WIRE_VERSION = 5
 """That of every message that is sent."""
 SPOKEN_VERSIONS = (5,)
-"""Of messages that come over the link now."""
+"""Versions of messages that are taken from the link."""
 READ_VERSIONS = (4, 5)
-"""Of stored messages: in logs, in recordings, and on an edge's disk."""
+"""Versions of stored messages that are read: in logs, in recordings, and on an edge's disk."""
 MOST_VERSION = 255
 MOST_UNKNOWN_FIELDS = 16
 """Up to this many fields behind the last known one are skipped, in each array; more are no message of ours."""

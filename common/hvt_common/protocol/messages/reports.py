@@ -83,7 +83,7 @@ class Info(Message):
     window_ns: int = wire_field(Int(1, MOST_WINDOW_NS))
     """Length of the rolling window that the budget holds over."""
     class_names: tuple[str, ...] = wire_field(ListOf(Text(_CLASS_NAME_BYTES), _CLASS_NAMES))
-    """Of the edge's detector."""
+    """Class names of the edge's detector."""
     received_ns: int = wire_field(_TIME)
     """When the edge received the question, its clock (t1)."""
     answered_ns: int = wire_field(_TIME)
@@ -118,7 +118,7 @@ class Health:
     feedback_age_ms: int = wire_field(Int(-1, U32))
     """Since the last feedback from any ground; -1 for none yet."""
     frames_dropped_cpu: int = wire_field(_COUNT)
-    """Of `frames_dropped` those for which the machine was too slow; `Status.frames` has the others."""
+    """The part of `frames_dropped` for which the machine was too slow; `Status.frames` has the others."""
     frames_unanalyzed: int = wire_field(_COUNT)
     """Skipped by perception for want of time."""
     cores_needed: float = wire_field(_CORES)
@@ -133,7 +133,7 @@ class FailedPart:
 
     part: str = wire_field(Text(24))
     reason: str = wire_field(Text(160))
-    """Of the newest failure, a sentence."""
+    """A sentence on the newest failure."""
     failures: int = wire_field(Int(1, U32))
     failed_ns: int = wire_field(_TIME)
     """When it failed last, the edge's clock."""
@@ -153,7 +153,7 @@ class Status(Message):
     media_ns: int = wire_field(_TIME)
     """Length of the stream so far: frames of the source rate, dropped ones included, in nanoseconds."""
     last_base_sequence: int = wire_field(_LAST)
-    """Of the last access unit sent before this message; -1 for none."""
+    """Sequence number of the last access unit sent before this message; -1 for none."""
     last_still_sequence: int = wire_field(_LAST)
     base_bytes: int = wire_field(_COUNT)
     roi_bytes: int = wire_field(_COUNT)

@@ -127,8 +127,8 @@ class StillWire(OfStill):
     TRIMMED: ClassVar[bool] = True
 
     place: tuple[int, ...] = wire_field(ListOf(_PLACE, 10))
-    """Of the crop x, y, width and height; how far inside its sides those of the track's box are, left, top, right,
-    bottom, in eighths; and, where it is not the crop's own, the coded size."""
+    """The crop's x, y, width and height; how far the track's box lies inside its left, top, right and bottom side,
+    in eighths; and, where it is not the crop's own, the coded size."""
     class_name: int | str = wire_field(Listed(MOST_CLASSES - 1, 64))
     """The first is its index in `Info.class_names`."""
     confidence: float = wire_field(Scaled(0, 1, 1000))
@@ -220,7 +220,7 @@ class RoiHeader(OfStill):
 
     @classmethod
     def of_version(cls, version: int, values: list[Any]) -> Self:
-        """Of version 4 as its fields stand here."""
+        """The message whose ``values`` are those of version 4."""
         if version < _COMPACT:
             return from_values(cls, values, version)
         return from_values(StillWire, values, version).header()  # type: ignore[return-value]

@@ -46,7 +46,7 @@ def best_fitting(
     tried = {} if tried is None else tried
 
     def excess(place: int) -> float:
-        """Of the logarithm of the size; above 0 where it does not fit."""
+        """Excess of the size's logarithm; above 0 where it does not fit."""
         quality_pct = best[place]
         if quality_pct not in tried:
             tried[quality_pct] = codec.encode(crop_bgr, quality_pct=quality_pct, base_bgr=base_bgr)

@@ -65,7 +65,7 @@ class Refiner:
         self.tracks_refined = 0
         self.class_changes = 0
         self.tilt = tilt or ViewTilt()
-        """Of the view: no kind of vehicle is sure unless that is known to be steep."""
+        """No kind of vehicle is sure unless the view is known to be steep."""
         self._mode = mode
         self._vocabulary = vocabulary
         self._calibrated = calibrated
@@ -337,7 +337,7 @@ class Refiner:
 _ASLANT_FROM, _STEEP_BELOW = 0.75, 0.65
 _MOST_BOXES, _LEAST_BOXES = 150, 12
 _APART = 0.1
-"""Of the height of the picture: nearer ones differ by their kinds. So far apart must their quartiles lie."""
+"""Share of the picture's height that the quartiles must lie apart: nearer boxes differ by their kinds."""
 
 
 class ViewTilt:

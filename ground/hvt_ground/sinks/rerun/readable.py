@@ -107,7 +107,7 @@ def has_holes(path: Path, copy: Path) -> bool:
 
 
 def what_is_read(path: Path) -> str:
-    """Of a file that `readable` made a copy of, why, and which part: the beginning of a sentence."""
+    """Why `readable` made a copy of a file, and of which part: the beginning of a sentence."""
     next_at = _next_recording(path)
     several = f"is several recordings in one file, another begins after {next_at} bytes: the first"
     return several if next_at else "is damaged or breaks off: what can be read"

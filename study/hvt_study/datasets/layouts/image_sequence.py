@@ -31,7 +31,7 @@ class ImageSequence:
 
     folder: Path
     first_number: int = field(init=False)
-    """Of the first image; annotations count frames by these numbers."""
+    """Number of the first image; annotations count frames by these numbers."""
     frame_count: int = field(init=False)
     size: tuple[int, int] = field(init=False)
     """(width, height) of the first one in pixels."""

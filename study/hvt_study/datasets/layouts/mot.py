@@ -111,7 +111,7 @@ class TruthRows:
 
 
 def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
-    """Of a file whose classes from 1 on have these names; `UserError` names the line that is wrong."""
+    """Rows of a file whose classes from 1 on have these names; `UserError` names the line that is wrong."""
     rows = read_rows(truth, columns=_COLUMNS, least=7)
     rows = rows.only(rows["frame"] >= 1, accepted="a frame number from 1 on")
     classless = _in_the_world(rows)

@@ -28,7 +28,7 @@ class Options:
     view: float | None = None
     """Height that the virtual camera sees at its lowest, in heights of the picture."""
     seeds: tuple[int, ...] = (0,)
-    """Of the virtual camera's ways; each gives sequences of its own."""
+    """Seeds of the virtual camera's ways; each gives sequences of its own."""
     classes: tuple[str, ...] = ()
     """Names of the classes of YOLO's labels; none: those of ``classes.txt``."""
     labelled: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ def split_options(uri: str, place: str, *, accepted: Collection[str]) -> tuple[s
 
 
 def missing_labels(whose: str, file: Path | str) -> UserError:
-    """Of a sequence or set, in words, whose annotations are not there."""
+    """Error for a sequence or set, in words, whose annotations are not there."""
     return UserError(
         f"{whose} has no annotations {file}: add them, or ask for pictures alone with ?labels=none"
     )

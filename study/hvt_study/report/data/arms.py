@@ -17,7 +17,7 @@ from hvt_study.runs.video_shape import SAME_TOTAL
 
 @dataclass(frozen=True, slots=True, order=True)
 class Conditions:
-    """Of a flight; the defaults are those of ``hvt-study run``."""
+    """Conditions of a flight; the defaults are those of ``hvt-study run``."""
 
     size: tuple[int, int] = (1280, 720)
     """(width, height) of the base stream in pixels."""
@@ -149,7 +149,7 @@ class Setting:
     )
     """By whose they are and by sequence; of followers one a target."""
     _names: Mapping[str, str] = field(init=False, repr=False, compare=False)
-    """Of sequences by `clip_of`: the first that each has in the table."""
+    """Names of sequences by `clip_of`: the first that each has in the table."""
 
     def __post_init__(self) -> None:
         names: dict[str, str] = {}
@@ -174,7 +174,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Of the dataset, without the folders that lead to it."""
+        """Name of the dataset, without the folders that lead to it."""
         return place(self.datasets[0]) if len(self.datasets) == 1 else f"all {len(self.datasets)} datasets"
 
     @property

@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Of a column."""
+    """Head of a column."""
 
     text: str
     number: bool = True
@@ -26,7 +26,7 @@ def words(*texts: str) -> tuple[Head, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Of a table."""
+    """Cell of a table."""
 
     text: str
     under: str = ""

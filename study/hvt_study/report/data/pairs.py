@@ -40,7 +40,7 @@ class Pair:
         return {name: gap for name, gap in gaps.items() if not np.isnan(gap)}
 
     def interval(self, column: str) -> Interval:
-        """Of the mean gap over the sequences of both; none of few sequences."""
+        """Interval of the mean gap over the sequences of both; none for few sequences."""
         return interval_of(self.gaps(column))
 
     def most_off_pct(self) -> float:
@@ -61,7 +61,7 @@ def pairs(setting: Setting, *, references: tuple[str, ...] | None = None) -> Ite
 
 @dataclass(frozen=True, slots=True)
 class EqualQuality:
-    """Of one arm against one video-only method."""
+    """Bits of one arm against one video-only method, at equal quality."""
 
     arm: Arm
     reference: str

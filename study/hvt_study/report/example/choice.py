@@ -19,7 +19,7 @@ from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, is_vide
 from hvt_study.report.data.pairs import pairs
 
 PERCENTILES = (10, 50, 90)
-"""Of the gain in PSNR: the stills that are shown."""
+"""Percentiles of the gain in PSNR at which the stills that are shown lie."""
 _GAIN = "named_f1"
 _PREFERRED = "M6"
 
@@ -80,7 +80,7 @@ class Timeline:
     roi_kbps: tuple[float, ...]
     other_kbps: tuple[float, ...]
     f1: tuple[float, ...]
-    """Of the list, whatever the classes."""
+    """F1 of the list, whatever the classes."""
     named_before: tuple[float, ...]
     """Found & named, without the stills' word."""
     named: tuple[float, ...]
@@ -95,7 +95,7 @@ class Example:
 
     key: str
     digest: str
-    """Of all payloads, as in its row: it is the same flight."""
+    """Digest of all payloads, as in its row: it is the same flight."""
     rule: str
     title: str
     """Sequence, method, regime and labels, in words."""

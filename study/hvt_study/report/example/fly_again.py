@@ -209,7 +209,7 @@ def _rates(
 
 
 def _scores(report: FlightReport, context: RunContext) -> dict[str, tuple[float, ...]]:
-    """Of each second, by the metrics of the table."""
+    """Scores of each second, by the metrics of the table."""
     listed, known = refined_frames(report.lists, context.labels), context.classes
     frames = judged(listed, word=known.word, classes=known.classes)
     parts = [frames[first : first + _SECOND_FRAMES] for first in range(0, len(frames), _SECOND_FRAMES)]

@@ -63,7 +63,7 @@ _RC: Mapping[str, Any] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """Of a method: any of the three tells it from its neighbours."""
+    """Style of a method: any of the three tells it from its neighbours."""
 
     colour: str
     marker: str

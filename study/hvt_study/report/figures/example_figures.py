@@ -14,7 +14,7 @@ from hvt_study.report.figures.drawing import GREY, INK, PALETTE, drawn, plain_ax
 
 _LANE_IN = 0.18
 _LEAST_PX = 360
-"""Of the longer side of a crop in files: 3 cm at 300 dots an inch."""
+"""Least longer side of a crop in files: 3 cm at 300 dots an inch."""
 
 
 def crop_pictures(example: Example) -> Pictures:
@@ -89,7 +89,7 @@ def _row(crop: CropExample) -> PictureRow:
 
 
 def _which(example: Example) -> str:
-    """Of its stills, as far as there are as many."""
+    """Which percentiles its stills show, as far as there are as many."""
     if example.stills == 1:
         return "its only still, with its gain in PSNR"
     shown = [f"{crop.percentile}th" for crop in example.crops]
