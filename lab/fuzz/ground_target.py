@@ -88,7 +88,8 @@ def _session(data: bytes) -> None:
     edge.close()
     _sinks.close(within_s=0.0)  # without footers
     assert ended, "the unharmed messages alone are a session"
-    assert not edge.failures.parts
+    failed = {one.part for one in edge.failures.parts}
+    assert failed <= {"video of uav-1"}, "which tells of messages of another version"
     assert all(len(session.reception.take_results(10_000)) < 5000 for session in ended)
 
 

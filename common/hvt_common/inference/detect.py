@@ -25,7 +25,7 @@ from hvt_common.inference.labels import (
     detector_labels,
     read_labels,
 )
-from hvt_common.inference.letterbox import Letterboxer, as_bgr, prepared_as
+from hvt_common.inference.letterbox import Letterboxer, as_bgr, prepared_as, without_palette
 from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
 from hvt_common.inference.runtimes.first_steps import own_steps
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
@@ -52,8 +52,6 @@ _THERMAL_SHARE, _THERMAL_RAISED = 0.75, 0.3
 """A small picture without colour is enlarged to this share of that side: twice as large, 640x512 shows a third fewer
 people. The second network of a file is silent there and cannot agree (`averaged`): scores rise by this, of the logit.
 """
-_LEAST_COLOUR = 0.5
-"""The mean of |B - G| and |G - R| in a picture with colour, as `hvt_train.join` has it."""
 _BROKEN = 0.1
 """Where no more of an answer is no number, that is some cells; the scores of one class are a fifth."""
 _TWIN_IOU = 0.8
@@ -242,8 +240,8 @@ class OnnxDetector:
         Raises `UserError` where it does not run, or no number comes out: that is no picture without objects.
         """
         image = as_bgr(image_bgr)
-        step = np.diff(image[::8, ::8].astype(np.int16), axis=2)
-        thermal = max(image.shape) < self._enlarge_to and float(np.abs(step).mean()) <= _LEAST_COLOUR
+        image, is_grey = without_palette(image) if self._enlarge_to else (image, False)
+        thermal = is_grey and max(image.shape) < self._enlarge_to
         input_size = self.input_size((image.shape[1], image.shape[0]), share=share, thermal=thermal)
         tensor, letterbox = self._letterboxer.fill(image, input_size)
         least = min(self._confidence, WEAK) if self._averages else self._confidence

@@ -14,6 +14,12 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.values import Boxes, Image
 
+_LEAST_COLOUR, _PALETTE_COLOUR = 0.5, 50.0
+"""Least mean of |B - G| and |G - R| in a picture with colour, as `hvt_train.join` has it; in a thermal palette."""
+_UNEXPLAINED = 0.15
+"""Share of the colours' variance that the brightness may leave unexplained: .11 at most under a palette like "iron",
+behind JPEG too; .33 at least in pictures of the sea, whose colours are the strongest."""
+
 
 @dataclass(frozen=True, slots=True)
 class OwnSteps:
@@ -228,6 +234,28 @@ class Letterboxer:
 def _bits(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     # The same memory in a type that OpenCV knows.
     return values.view(np.uint16) if values.dtype == np.float16 else values
+
+
+def without_palette(image_bgr: Image) -> tuple[Image, bool]:
+    """A thermal picture whose palette rises in brightness, such as "iron", in grey; any other as it is.
+
+    And whether it has no colour then. Strong colours that follow from the brightness alone are a palette's.
+    """
+    some = image_bgr[::8, ::8].reshape(-1, 3)
+    colours = np.diff(some.astype(np.float32), axis=1)
+    strength = float(np.abs(colours).mean())
+    if strength < _PALETTE_COLOUR:
+        return image_bgr, strength <= _LEAST_COLOUR
+    levels = np.asarray(cv2.cvtColor(some[None], cv2.COLOR_BGR2GRAY), np.uint8).ravel() >> 3
+    count = np.maximum(np.bincount(levels, minlength=32), 1)
+    means = np.stack([np.bincount(levels, one, 32) / count for one in colours.T], axis=1)
+    if (
+        np.square(colours - means[levels]).sum()
+        > _UNEXPLAINED * np.square(colours - colours.mean(axis=0)).sum()
+    ):
+        return image_bgr, False
+    grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
+    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8), True
 
 
 def as_bgr(image: npt.NDArray[np.uint8]) -> Image:

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, detect_every, detect_still_every, open_detector
 from hvt_common.inference.heads.contract import YoloxCells
-from hvt_common.inference.letterbox import Letterbox, Letterboxer, Preparation, as_bgr
+from hvt_common.inference.letterbox import Letterbox, Letterboxer, Preparation, as_bgr, without_palette
 from hvt_common.inference.nms import MAX_CANDIDATES, MAX_DETECTIONS, suppress
 from hvt_common.inference.runtimes.model import open_model
+from hvt_common.values import Image
 from hvt_models.detectors.motion import MotionDetector
 from hvt_models.forms import Dense, Listed, PerQuery
 from media.head_models import family_model
@@ -206,6 +207,26 @@ def test_a_picture_that_fits_is_not_copied_whole():
     finally:
         tracemalloc.stop()
     assert held < tensor.nbytes + picture.nbytes / 2
+
+
+def test_a_thermal_palette_is_shown_in_grey() -> None:
+    """Under "iron" hardly a person was found, for .65 of them in the same pictures in grey."""
+    rng = np.random.default_rng(5)
+    heat = cv2.GaussianBlur(rng.integers(0, 256, (240, 320), np.uint8), (0, 0), 6)
+    heat = np.asarray(cv2.normalize(heat, heat, 20, 235, cv2.NORM_MINMAX), np.uint8)
+    for palette in (cv2.COLORMAP_INFERNO, cv2.COLORMAP_HOT, cv2.COLORMAP_PLASMA):
+        _, coded = cv2.imencode(".jpg", cv2.applyColorMap(heat, palette), [cv2.IMWRITE_JPEG_QUALITY, 85])
+        shown, is_grey = without_palette(np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8))
+        assert is_grey
+        assert np.ptp(shown, axis=2).max() == 0
+        assert np.corrcoef(shown[:, :, 0].ravel(), heat.ravel())[0, 1] > 0.9
+    grey: Image = np.repeat(heat[:, :, None], 3, axis=2)
+    shades = np.stack([np.roll(heat, 40 * by, axis=1) for by in range(3)], axis=2)
+    photographs: list[Image] = [shades, grey // np.array([4, 2, 1], np.uint8)]
+    for image in (grey, *photographs):
+        shown, is_grey = without_palette(image)
+        assert shown is image
+        assert is_grey == (image is grey)
 
 
 def test_the_border_is_grey_114() -> None:
