@@ -106,10 +106,14 @@ def listening_trouble(error: OSError) -> str:
 class FlightError(Exception):
     """Something that went wrong after the start and cannot be put right: one sentence, and exit code 1.
 
-    A supervisor starts the program again, which may help.
+    A supervisor starts the program again, which may help. ``summary`` is that of the flight, where it had begun.
     """
 
     said = False
+
+    def __init__(self, sentence: str, *, summary: Any = None) -> None:
+        super().__init__(sentence)
+        self.summary = summary
 
 
 class Parser(argparse.ArgumentParser):

@@ -86,7 +86,8 @@ class Edge:
     def run(self) -> dict[str, Any]:
         """Play the source to its end or until ``stop`` is set; return the summary.
 
-        Raises `UserError` before anything is sent, where a setting, a file or a port cannot be used.
+        Raises `UserError` before anything is sent, where a setting, a file or a port cannot be used, and
+        `FlightError` with the summary after that.
         """
         config, world = self._config, self._world
         check_files(config)
@@ -144,17 +145,22 @@ class Edge:
                     turn=lambda: stages.heartbeat.turn("waiting"),
                 )
             stages.link.operating.start(world.clock())
+            broken: Exception | None = None
             try:
                 self._play(source, stages, link, line)
-            except UserError as error:
+            except (UserError, FlightError) as error:
                 if not self._counts.encoded:
                     raise
-                raise FlightError(str(error)) from error
+                broken = error
+                self._failures.failed("flight", str(error), last=True)
             finally:
                 stages.stills.chooser.close()
                 self._say_goodbye(stages, link)
         unreached = "" if self._reached else link.trouble or "nobody subscribed to its video"
-        return summary(stages.heartbeat, unreached=unreached)
+        content = summary(stages.heartbeat, unreached=unreached)
+        if broken is not None:
+            raise FlightError(str(broken), summary=content) from broken
+        return content
 
     def _play(self, source: Source, stages: Stages, link: EdgeLink, line: StatusLine) -> None:
         next_status_ns = restarts = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
@@ -60,7 +60,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(redaction.text(to_toml(config)), end="")
         return 0
     config = check(config)
-    from hvt_common.runtime.reporting import print_table, write_json  # noqa: PLC0415
+    from hvt_common.runtime.reporting import print_table, reported, write_json  # noqa: PLC0415
     from hvt_edge.app import Edge  # noqa: PLC0415
     from hvt_edge.report.status import in_vain, table, title  # noqa: PLC0415
     from hvt_edge.world import World  # noqa: PLC0415
@@ -80,14 +80,18 @@ def _run(argv: Sequence[str] | None) -> int:
     if note := note_on_share(config, given=given.values):
         logging.getLogger(START_LOGGER).info("%s", note)
     stop = stop_on_signals()
-    with log.ending():
-        content = redaction.value(Edge(config, stop=stop, on_started=log.release, world=world).run())
+
+    def report(summary: dict[str, Any]) -> None:
+        content = redaction.value(summary)
         if log.as_json:
             log.result(content)
         else:
             print_table(title(content), table(content))
         if config.summary is not None:
             write_json(config.summary, content)
+
+    with log.ending():
+        content = reported(Edge(config, stop=stop, on_started=log.release, world=world).run, report)
     return 1 if in_vain(content) else 0
 
 

@@ -116,7 +116,7 @@ class PushedEdge:
         except _NothingPushed:
             pass
         except BaseException as error:  # noqa: BLE001 - handed to the program
-            self._error = error
+            self._error, self.summary = error, getattr(error, "summary", None) or {}
 
 
 def _nanoseconds(capture_ns: int) -> int:

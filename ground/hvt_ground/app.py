@@ -89,12 +89,20 @@ class Ground:
         """Serve edges until ``stop`` is set, or with ``--once`` until they have ended; return a summary a session.
 
         Raises `UserError` before anything is received, where a setting, a file or a port cannot be used, and
-        `FlightError` after that. Models are opened beside the link: one that cannot be used ends the run within
-        seconds.
+        `FlightError` with the summaries after that. Models are opened beside the link: one that cannot be used ends
+        the run within seconds.
         """
+        check_outputs(self._config, records=self._program is None)
+        models = Models(self._config)
+        try:
+            self._fly(models)
+        except FlightError as error:
+            error.summary = self._summaries(models)
+            raise
+        return self._summaries(models)
+
+    def _fly(self, models: Models) -> None:
         config = self._config
-        check_outputs(config, records=self._program is None)
-        models = Models(config)
         with ExitStack() as stack:
             view: LiveView | None = None
             if config.view or config.serve:
@@ -159,15 +167,18 @@ class Ground:
                 late={one.part for one in models.failures.now},
             )
             try:
-                self._serve(link, factory, line, watch, models, services, group)
-                models.give_up()
-                self._close_edges()
+                try:
+                    self._serve(link, factory, line, watch, models, services, group)
+                    models.give_up()
+                finally:
+                    self._close_edges()
+                self._raise_error()
             except Exception as error:
                 if models.error is not None:
                     raise models.error from None
                 raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
-            finally:
-                self._stop_edges()
+
+    def _summaries(self, models: Models) -> list[dict[str, Any]]:
         return [
             completed(content, sessions, sinks=sinks, failures=models.failures)
             for edge, sessions in sorted((self._moved | self._edges).items())
@@ -277,14 +288,11 @@ class Ground:
         return gone
 
     def _close_edges(self) -> None:
-        self._stop_edges()
-        for one in (*self._edges.values(), *self._leaving):
-            one.join()
-        self._raise_error()
-
-    def _stop_edges(self) -> None:
+        # Several finish in the time of one.
         for one in self._edges.values():
             one.stop()
+        for one in (*self._edges.values(), *self._leaving):
+            one.join()
 
     def _raise_error(self) -> None:
         for one in (*self._edges.values(), *self._leaving):

@@ -117,7 +117,7 @@ class Listening:
         try:
             self.summaries = self._ground.run()
         except BaseException as error:  # noqa: BLE001 - handed to the program
-            self._error = error
+            self._error, self.summaries = error, getattr(error, "summary", None) or []
 
 
 class _Events(queue.Queue[Received]):

@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import pytest
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.inference.detect import Detector
+from hvt_common.runtime.reporting import reported
 from hvt_common.values import Detections, Frame, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
@@ -103,6 +104,34 @@ def test_a_wrong_endpoint_is_refused_before_a_model_is_opened(tmp_path):
     with pytest.raises(UserError, match="is not usable: PROTOCOL"):
         Edge(check(config), stop=threading.Event(), world=world).run()
     assert world.opened == 0
+
+
+class TornWorld(World):
+    """Its source breaks off."""
+
+    def open_source(self, config: EdgeConfig) -> Source:
+        """See there."""
+
+        def before(frame: Frame) -> None:
+            if frame.index == 6:
+                raise UserError("it is torn")
+
+        return PassedOn(super().open_source(config), before=before)
+
+
+def test_a_flight_that_breaks_off_is_reported_all_the_same(tmp_path):
+    """Table and --summary of an hour were lost with the last second."""
+    write_scene(tmp_path, frames=10)
+    config = EdgeConfig(
+        source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M0",
+        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0, pace="lockstep",
+    )  # fmt: skip
+    told = []
+    with pytest.raises(FlightError, match="it is torn"):
+        reported(Edge(check(config), stop=threading.Event(), world=TornWorld()).run, told.append)
+    (summary,) = told
+    assert summary["frames"] == 6
+    assert [(one["part"], one["reason"]) for one in summary["failed"]] == [("flight", "it is torn")]
 
 
 class FragileDetector(Detector):

@@ -191,8 +191,10 @@ class Failing(threading.Event):
 def test_what_cannot_be_put_right_in_flight_is_one_sentence(free_port: int, tmp_path: Path) -> None:
     """A supervisor would read a traceback, and not know whether to start it again."""
     ground = Ground(config(free_port, tmp_path), stop=Failing())
-    with pytest.raises(FlightError, match=r"^the ground cannot go on: RuntimeError: can't start new thread$"):
+    said = r"^the ground cannot go on: RuntimeError: can't start new thread$"
+    with pytest.raises(FlightError, match=said) as raised:
         ground.run()
+    assert raised.value.summary == [], "of no session, for none was there"
 
 
 @pytest.mark.integration

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self, TextIO
@@ -119,6 +119,20 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
         )  # not markup: a path may have brackets in it
     with _going_on(sys.stdout):
         _Console(highlight=False).print(table)
+
+
+def reported(run: Callable[[], Any], report: Callable[[Any], None]) -> Any:
+    """Return the summary of a flight after ``report`` of it, also of one that breaks off with a `FlightError`."""
+    broken = None
+    try:
+        summary = run()
+    except FlightError as error:
+        summary, broken = error.summary, error
+    if summary is not None:
+        report(summary)
+    if broken is not None:
+        raise broken
+    return summary
 
 
 def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) -> None:
