@@ -42,6 +42,8 @@ _IN_SEGMENTS = "hls"
 """The format in which seconds come at once: each packet is held back until it is due by its own time."""
 _OF_NO_SIZE = ("_pipe", "jpeg", "hls", "sdp")
 """Endings of the formats of which the size is one picture's, a description's, or invented by a camera."""
+_LEAST_INVENTED = 2**31 - 1
+"""Cameras that send for ever give such lengths, for HTTP wants one."""
 _PLAYLIST = ".m3u8"
 _MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
 """A packet later or earlier than this sets the time for the next ones: after a stall, or a jump of the stamps."""
@@ -83,8 +85,10 @@ class StreamGrabber:
     @property
     def holds_a_clip(self) -> bool:
         """Whether it has a known duration, or a size: a file behind an address, not a live stream."""
-        sized = self._container.size > 0 and not self._container.format.name.endswith(_OF_NO_SIZE)
-        return sized or bool(self._container.duration)
+        sized = 0 < self._container.size < _LEAST_INVENTED
+        return (sized and not self._container.format.name.endswith(_OF_NO_SIZE)) or bool(
+            self._container.duration
+        )
 
     def restart(self) -> None:
         self.close()

@@ -405,8 +405,8 @@ class Live(BaseHTTPRequestHandler):
         self.send_response(200)
         self.send_header("Content-Type", "video/mp2t")
         at_once = self.path == "/whole.ts"
-        if at_once:
-            self.send_header("Content-Length", str(len(self.stream)))
+        if at_once or self.path == "/invented.ts":
+            self.send_header("Content-Length", str(len(self.stream) if at_once else 2**31 - 1))
         self.end_headers()
         try:
             for start in range(0, len(self.stream), 188 * 8):
@@ -434,8 +434,10 @@ def http_stream(tmp_path):
     thread.join()
 
 
-def test_an_http_stream_plays_live_and_comes_back_after_it_ends(http_stream, caplog):
+@pytest.mark.parametrize("length", ["live", "invented"])
+def test_an_http_stream_plays_live_and_comes_back_after_it_ends(http_stream, caplog, length):
     """A camera that restarts would end the flight's telemetry."""
+    http_stream = http_stream.replace("live", length)
     began = time.time_ns()
     with caplog.at_level(logging.WARNING), open_source(http_stream, size=(320, 180), fps=100) as source:
         assert source.live
