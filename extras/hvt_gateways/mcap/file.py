@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -31,6 +32,7 @@ from hvt_gateways.decodable import DecodableRun
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Shown, VideoSample
 from hvt_ground.recordings.row import RecordedStill
 from hvt_ground.sinks import SinkWriter
+from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.palette import Rgb, class_colour
 from hvt_ground.sinks.rerun.stills import event_text, still_picture
 
@@ -50,9 +52,18 @@ class McapFile(SinkWriter[Event]):
         self.path: Path = path
         self._edge = edge
         self._run = DecodableRun()
+        fresh = has_nothing(path)
         with telling(f"MCAP file {path} cannot be created: "):
             self._file: BinaryIO = path.open("wb")
-            self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
+            try:
+                self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
+                self._file.flush()
+            except OSError:
+                with suppress(OSError):
+                    self._file.close()
+                if fresh:  # or each try on a full disk would leave one more
+                    path.unlink(missing_ok=True)
+                raise
 
     def log(self, item: Event | RecordedStill) -> None:
         """Write events that have a schema, and stills that were read back; ignore the rest."""

@@ -20,6 +20,7 @@ import av.error
 from hvt_common.errors import UserError, named_path, telling
 from hvt_common.files import check_there
 from hvt_common.runtime.host_names import is_group, with_small_scheme
+from hvt_ground.sinks.line_file import has_nothing
 
 _log = logging.getLogger(__name__)
 
@@ -184,10 +185,13 @@ class AsynchronousKlv:
 
 
 class StreamFile:
-    """A file; takes the place of one of that name. `UserError` where it cannot be written, or no further."""
+    """A file; takes the place of one of that name. `UserError` where it cannot be written, or no further.
+
+    One to which nothing could be written is removed: each try on a full disk would leave one more.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._leaves_none = path, has_nothing(path)
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
         with telling(f"MPEG-TS file {path} cannot be created: "):
             self._file = os.open(path, flags, 0o644)
@@ -198,12 +202,15 @@ class StreamFile:
             check_there(self._file, self._path)
             while left:
                 left = left[os.write(self._file, left) :]
+                self._leaves_none = False
         return len(data)
 
     def close(self) -> None:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+            if self._leaves_none and has_nothing(self._path):
+                self._path.unlink(missing_ok=True)
 
 
 class Datagrams:

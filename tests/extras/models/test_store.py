@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
-import resource
 import subprocess
 import sys
 import threading
@@ -30,6 +29,7 @@ from hvt_models.inspect import inspect_model
 from hvt_models.manifest import builtin_manifest, parse_manifest
 from hvt_models.store import Store, cache_folder, file_digest
 from media.onnx_models import colour_classifier, colour_detector, constant_model
+from programs.small_disk import files_at_most
 
 CONTENT = np.random.default_rng(7).bytes(300_000)
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -407,16 +407,10 @@ def test_a_full_disk_leaves_the_model_of_before(folder: Path, tmp_path: Path) ->
     small.write_bytes(b"1")
     large.write_bytes(bytes(2**16))
     store.add(small, name="mine", sha256=file_digest(small))
-    most, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2**15, hard))
-        with pytest.raises(UserError, match="cannot be copied"):
-            store.add(large, name="mine", sha256=file_digest(large))
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
-        with pytest.raises(UserError, match=r"added.toml cannot be written"):
-            store.add(small, name="other", sha256=file_digest(small))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+    with files_at_most(2**15), pytest.raises(UserError, match="cannot be copied"):
+        store.add(large, name="mine", sha256=file_digest(large))
+    with files_at_most(1), pytest.raises(UserError, match=r"added.toml cannot be written"):
+        store.add(small, name="other", sha256=file_digest(small))
     assert store.verified("mine").read_bytes() == b"1"
 
 

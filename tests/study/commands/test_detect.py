@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import resource
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from hvt_scene.truth import Truth
 from hvt_study.cli import main
 from hvt_study.commands.detect import print_score
 from hvt_study.metrics.picture_score import along_line, calibration_error, chance_error, fitted_line
+from programs.small_disk import files_at_most
 
 CLASSES = "car,van,truck,bus,motor,pedestrian,other"
 
@@ -196,13 +196,9 @@ def test_what_cannot_be_is_said_before_anything_is_written(
 def test_a_full_disk_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An hour of detections ended in a traceback, or in a sheet that nobody missed."""
     folder, out = draw(tmp_path / "set", moments=1), tmp_path / "out"
-    most, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     for limit in (10, 20_000):  # of the table, and of the sheets
-        try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+        with files_at_most(limit):
             said = sentence(capsys, folder, "--out", out)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
         assert said == f"hvt-study: --out {out} cannot be written (File too large): name another"
     assert json.loads((out / "score.json").read_text())["pictures"] == 1
 

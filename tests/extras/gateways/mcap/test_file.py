@@ -10,6 +10,7 @@ from mcap.reader import NonSeekingReader
 from hvt_common.errors import UserError
 from hvt_gateways.mcap.file import McapFile
 from hvt_ground.events import Notice
+from programs.small_disk import files_at_most
 
 
 def test_a_ground_that_was_killed_leaves_all_but_the_last_moment(tmp_path: Path) -> None:
@@ -29,8 +30,12 @@ def test_a_ground_that_was_killed_leaves_all_but_the_last_moment(tmp_path: Path)
     file.close()
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
-def test_a_full_disk_at_its_end_is_a_sentence() -> None:
-    """The last chunk is in a buffer until then: an operator would read an error number."""
-    with pytest.raises(UserError, match="MCAP file /dev/full cannot be finished: No space left on device"):
-        McapFile(Path("/dev/full"), edge="uav-1").close()
+def test_a_full_disk_is_a_sentence_and_leaves_no_empty_file(tmp_path: Path) -> None:
+    """Each try for an hour left one, and said that MCAP works again; at the end an operator read an error number."""
+    ended = McapFile(tmp_path / "ended.mcap", edge="uav-1")
+    with files_at_most(0):
+        with pytest.raises(UserError, match=r"MCAP file .*new\.mcap cannot be created: File too large"):
+            McapFile(tmp_path / "new.mcap", edge="uav-1")
+        with pytest.raises(UserError, match=r"MCAP file .*ended\.mcap cannot be finished: File too large"):
+            ended.close()
+    assert [one.name for one in tmp_path.iterdir()] == ["ended.mcap"]

@@ -19,6 +19,7 @@ from hvt_gateways.transport_stream.destination import (
     check_destination,
     destination,
 )
+from programs.small_disk import files_at_most
 
 
 def test_files_folders_and_urls(tmp_path):
@@ -140,10 +141,12 @@ def test_a_file_that_is_gone_or_full_is_said(tmp_path):
     with pytest.raises(UserError, match=r"flight.ts cannot be written any further: it was removed"):
         file.write(b"x")
     file.close()
-    full = StreamFile(Path("/dev/full"))
-    with pytest.raises(UserError, match="No space left"):
-        full.write(b"x")
-    full.close()
+    for full in (StreamFile(Path("/dev/full")), StreamFile(tmp_path / "full.ts")):
+        with files_at_most(0), pytest.raises(UserError, match=r"No space left|File too large"):
+            full.write(b"x")
+        full.close()
+    assert Path("/dev/full").exists()
+    assert not list(tmp_path.iterdir()), "each try on a full disk would leave one more"
     with pytest.raises(UserError, match="cannot be created"):
         StreamFile(tmp_path / "absent" / "flight.ts")
 
