@@ -49,6 +49,7 @@ from hvt_edge.wiring import (
 )
 from hvt_edge.world import World
 
+_PART = "flight"
 _GOODBYE_S = 1.5
 _STUCK_S = 5.0
 """A loop that has not turned for this long, and two frames longer, hangs."""
@@ -152,7 +153,7 @@ class Edge:
                 if not self._counts.encoded:
                     raise
                 broken = error
-                self._failures.failed("flight", str(error), last=True)
+                self._failures.failed(_PART, str(error), last=True)
             finally:
                 stages.stills.chooser.close()
                 self._say_goodbye(stages, link)

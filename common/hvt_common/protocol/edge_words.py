@@ -81,6 +81,7 @@ PART_WORDS: Mapping[str, str] = MappingProxyType(
         "control": "taking commands",
         "listener": "waiting for grounds",
         "metrics": "the port for metrics",
+        "flight": "the flight, which broke off",
     }
 )
 """Part of an edge that may fail → its name for people."""

@@ -22,7 +22,7 @@ _REASONS = frozenset(STILL_WORDS)
 _EDGE_PARTS = frozenset(
     (
         *("source", "encoder", "video", "passthrough", "local copy", "stills", "requested stills", "reports"),
-        *("pose", "store", "backlog", "detector", "metrics", "listener", *map(str, Channel)),
+        *("pose", "store", "backlog", "detector", "metrics", "listener", "flight", *map(str, Channel)),
     )
 )
 
