@@ -153,7 +153,7 @@ class Edge:
                 if not self._counts.encoded:
                     raise
                 broken = error
-                self._failures.failed(_PART, str(error), last=True)
+                self._failures.failed(_PART, str(error), said=True)
             finally:
                 stages.stills.chooser.close()
                 self._say_goodbye(stages, link)

@@ -119,7 +119,7 @@ class TornWorld(World):
         return PassedOn(super().open_source(config), before=before)
 
 
-def test_a_flight_that_breaks_off_is_reported_all_the_same(tmp_path):
+def test_a_flight_that_breaks_off_is_reported_all_the_same(tmp_path, caplog):
     """Table and --summary of an hour were lost with the last second."""
     write_scene(tmp_path, frames=10)
     config = EdgeConfig(
@@ -132,6 +132,7 @@ def test_a_flight_that_breaks_off_is_reported_all_the_same(tmp_path):
     (summary,) = told
     assert summary["frames"] == 6
     assert [(one["part"], one["reason"]) for one in summary["failed"]] == [("flight", "it is torn")]
+    assert "all else goes on" not in caplog.text
 
 
 class FragileDetector(Detector):

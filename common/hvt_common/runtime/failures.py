@@ -102,11 +102,11 @@ class Failures:
             if not (one.working or one.over)
         )
 
-    def failed(self, part: str, reason: str, *, last: bool = False) -> int:
+    def failed(self, part: str, reason: str, *, last: bool = False, said: bool = False) -> int:
         """It has stopped, for the how manieth time. The log says so once, however often it is tried in vain.
 
         The ground, who watches the process and the summary are told the reason, without secrets of an address.
-        ``last``: it ends, and is not tried again.
+        ``last``: it ends, and is not tried again. ``said``: the program ends with that sentence.
         """
         reason = _one_line(_REDACTION.text(reason))
         now_ns = self._clock()
@@ -116,6 +116,8 @@ class Failures:
             anew = before is None or before.working or before.over
             since_ns = now_ns if before is None or anew else before.since_ns
             self._parts[part] = Failure(part, reason, count, now_ns, since_ns)
+        if said:
+            return count
         if anew and (before is None or now_ns - before.failed_ns > _STEADY_NS or count.bit_count() == 1):
             self._said.add(part)
             times = "" if count == 1 else f" ({count} failures so far)"
