@@ -123,15 +123,13 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 def reported(run: Callable[[], Any], report: Callable[[Any], None]) -> Any:
     """Return the summary of a flight after ``report`` of it, also of one that breaks off with a `FlightError`."""
-    broken = None
     try:
         summary = run()
     except FlightError as error:
-        summary, broken = error.summary, error
-    if summary is not None:
-        report(summary)
-    if broken is not None:
-        raise broken
+        if error.summary is not None:
+            report(error.summary)
+        raise
+    report(summary)
     return summary
 
 
