@@ -91,13 +91,13 @@ class LocalCopy:
             self._fail(error)
 
     def _append(self, unit: AccessUnit) -> None:
-        if self._file is None:
+        if begins := self._file is None:
             if not unit.keyframe or not self._pause.due(time.monotonic_ns()):
                 return
             self._file = _MatroskaFile(*_opened(self._path))
-            if self._file.path != self._path:
-                _log.warning("--record-base %s is there already: this is %s", self._path, self._file.path)
         self._file.write(unit)
+        if begins and self._file.path != self._path:  # not before: a full disk takes nothing, at each try
+            _log.warning("--record-base %s is there already: this is %s", self._path, self._file.path)
         self._failures.works(_PART)
 
     def _fail(self, error: Exception) -> None:

@@ -152,6 +152,14 @@ def test_a_full_card_stops_the_copy_alone_and_it_goes_on_in_a_new_file(tmp_path,
             assert failed.part == "local copy"
             assert "No space left" in failed.reason
             assert not failed.working
+
+            def in_vain() -> bool:
+                for unit in coded:
+                    recorder.write(unit)
+                return failures.parts[0].count >= 3
+
+            eventually(in_vain, what="it is tried again")
+            assert "is there already" not in caplog.text, "each try said so of a file that took nothing"
             (card / "old.bin").unlink()
 
             def again() -> bool:
