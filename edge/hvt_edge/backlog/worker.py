@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from hvt_common.errors import foreign
 from hvt_common.protocol.messages import (
     AcknowledgedRange,
     BacklogKind,
@@ -371,7 +372,7 @@ class StoreWorker:
             do()
         except OSError as error:
             self._fail(error)
-        except Exception as error:  # noqa: BLE001 - a failure stops sending, never storing nor the flight
+        except foreign() as error:  # Zenoh may panic: that stops sending, never storing nor the flight
             self._backfill.put_aside()
             self._sending_retry.failed(self._clock())
             self._failures.failed(_SENDING_PART, f"what was stored is not sent ({reason_of(error)})")

@@ -328,13 +328,18 @@ def test_what_a_dying_run_had_kept_is_sent_by_the_next(tmp_path, caplog):
     worker.close()
 
 
-def test_an_error_in_sending_stops_sending_alone(tmp_path, caplog):
+class Panic(BaseException):
+    """As of Zenoh, which is written in Rust."""
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, Panic])
+def test_an_error_in_sending_stops_sending_alone(tmp_path, caplog, error):
     """A bug in what nobody watches would end the flight; or one object would hold up all others."""
     link, number_of_bad = Link(), 2
 
     def broken(chunk: Chunk) -> int:
         if chunk.key[2] == number_of_bad:
-            raise ZeroDivisionError
+            raise error
         return link.send(chunk)
 
     with opened(tmp_path) as store:
