@@ -96,7 +96,7 @@ def _edges(endpoint: str, count: int) -> None:
         tokens = [
             sessions[number % len(sessions)]
             .liveliness()
-            .declare_token(EdgeKeys(f"uav-{number}").key(Channel.ALIVE))
+            .declare_token(EdgeKeys(f"uav-{number}")[Channel.ALIVE])
             for number in range(count)
         ]
         print(len(tokens), flush=True)

@@ -33,7 +33,7 @@ _MOST_S = 100.0
 
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
-    ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 22),
+    ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 20),
     ("StillStage.analyze",): ("a frame's objects at the edge", 27),
     ("StillStage.send",): ("a still at the edge, from choosing to put", 26),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (

@@ -117,10 +117,10 @@ class Requester:
 
     def refusal(self, edge: str) -> str:
         """Why ``control`` of this edge need not be tried; empty where our own file allows it."""
-        key = EdgeKeys(edge).key(Channel.CONTROL)
+        key = EdgeKeys(edge)[Channel.CONTROL]
         if self.rights.allow_somebody(flow="egress", message="query", key=key):
             return ""
-        if self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge).key(Channel.INFO)):
+        if self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge)[Channel.INFO]):
             return (
                 f"{self.file} lets us watch {edge}, not command it: a key that hvt-ground keys add-ground makes "
                 "without --watch-only may"
@@ -216,7 +216,7 @@ class RemoteEdge:
         info = self.info()
         inbox = Inbox(capacity=_INBOX_MESSAGES)
         subscribers = [
-            subscribe(self._session, self._keys.key(channel), put=inbox.put)
+            subscribe(self._session, self._keys[channel], put=inbox.put)
             for channel in (Channel.ROI, Channel.STATUS)
         ]
         try:
@@ -288,7 +288,7 @@ class RemoteEdge:
         return "" if outcome is None else outcome.note
 
     def _why_late(self) -> str:
-        alive = self._session.liveliness().get(self._keys.key(Channel.ALIVE), timeout=ANSWER_S)
+        alive = self._session.liveliness().get(self._keys[Channel.ALIVE], timeout=ANSWER_S)
         if any(reply.ok is not None for reply in alive):
             return "the link is full, or has lost it"
         return "the edge is not there any more: it has ended, or its link is down"

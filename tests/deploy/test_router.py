@@ -71,7 +71,7 @@ def test_messages_questions_and_presence_pass(receiver: str) -> None:
         samples = other.declare_subscriber(selector(Channel.BASE))
         publisher = declare_publisher(edge, Channel.BASE, keys=KEYS)
         serve(edge, Channel.INFO, keys=KEYS, answer=lambda question: b"answer to " + question)
-        token = edge.liveliness().declare_token(KEYS.key(Channel.ALIVE))
+        token = edge.liveliness().declare_token(KEYS[Channel.ALIVE])
         eventually(lambda: publisher.matching_status.matching)
         unit = bytes(range(256)) * 120
         sample = _first(samples, lambda: publisher.put(unit, attachment=b"header"))

@@ -46,16 +46,16 @@ class _Edge:
         for row in (Channel.INFO, Channel.CONTROL):
             serve(session, row, keys=self.keys, answer=lambda _question, row=row: f"{row} of {name}".encode())
         session.declare_subscriber(
-            self.keys.key(Channel.FEEDBACK), lambda sample: self.reports.append(sample.payload.to_bytes())
+            self.keys[Channel.FEEDBACK], lambda sample: self.reports.append(sample.payload.to_bytes())
         )
-        self._token = session.liveliness().declare_token(self.keys.key(Channel.ALIVE))
+        self._token = session.liveliness().declare_token(self.keys[Channel.ALIVE])
 
     def wanted(self) -> bool:
         return all(one.matching_status.matching for one in self.publishers.values())  # type: ignore[attr-defined]
 
     def write(self) -> None:
         for row, publisher in self.publishers.items():
-            publisher.put(self.keys.key(row).encode())
+            publisher.put(self.keys[row].encode())
 
 
 class _Ground:
@@ -85,11 +85,11 @@ class _Ground:
 
     def report(self, text: bytes) -> None:
         for edge in EDGES:
-            self.session.put(EdgeKeys(edge).key(Channel.FEEDBACK), text)
+            self.session.put(EdgeKeys(edge)[Channel.FEEDBACK], text)
 
 
 def _all(edges: tuple[str, ...]) -> set[str]:
-    return {EdgeKeys(edge).key(row) for edge in edges for row in (*WRITTEN, Channel.ALIVE)}
+    return {EdgeKeys(edge)[row] for edge in edges for row in (*WRITTEN, Channel.ALIVE)}
 
 
 @pytest.mark.parametrize("links", [1, 2])
@@ -110,7 +110,7 @@ def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_po
             lambda: all(len(edge.session.info.links()) == links for edge in edges.values()),
             what="all links stand",
         )
-        eventually(lambda: EdgeKeys("uav-1").key(Channel.ALIVE) in guest.came, what="the guest sees the edge")
+        eventually(lambda: EdgeKeys("uav-1")[Channel.ALIVE] in guest.came, what="the guest sees the edge")
 
         def came(ground: _Ground, names: tuple[str, ...]) -> bool:
             for edge in edges.values():  # again: that one ground wants a stream says nothing of the other

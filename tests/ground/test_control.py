@@ -90,7 +90,7 @@ def edge(free_port, monkeypatch) -> Iterator[ScriptedEdge]:
     scripted = ScriptedEdge(free_port)
     with (
         open_session(LinkSettings("edge", listen=(scripted.endpoint,))) as session,
-        session.liveliness().declare_token(KEYS.key(Channel.ALIVE)),
+        session.liveliness().declare_token(KEYS[Channel.ALIVE]),
     ):
         scripted.serve(session)
         yield scripted

@@ -145,7 +145,7 @@ def send(endpoint: str, device: str, links: str) -> None:
             time.sleep(0.1)
             device_bytes, packets = (now - then for now, then in zip(_counters(device), before, strict=True))
             overhead = overhead_bytes(
-                size, ATTACHMENT_BYTES, key=KEYS.key(Channel.BASE), encoding=DELIVERIES[Channel.BASE].encoding
+                size, ATTACHMENT_BYTES, key=KEYS[Channel.BASE], encoding=DELIVERIES[Channel.BASE].encoding
             )
             rows.append(
                 {

@@ -85,18 +85,13 @@ def _check_name(name: str, what: str) -> None:
         raise UserError(f"{what} {name!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted")
 
 
-@dataclass(frozen=True, slots=True)
-class EdgeKeys:
-    """The keys of one edge. Raises UserError for an id outside ``[a-z0-9-]{1,32}``."""
+class EdgeKeys(dict[Channel, str]):
+    """Channel → key of one edge, such as ``hvt/uav-1/base``. UserError for an id outside ``[a-z0-9-]{1,32}``."""
 
-    edge: str
-
-    def __post_init__(self) -> None:
-        _check_name(self.edge, "edge id")
-
-    def key(self, channel: Channel) -> str:
-        """The full key, such as ``hvt/uav-1/base``."""
-        return f"{ROOT}/{self.edge}/{channel}"
+    def __init__(self, edge: str) -> None:
+        _check_name(edge, "edge id")
+        self.edge = edge
+        super().__init__({channel: f"{ROOT}/{edge}/{channel}" for channel in Channel})
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,9 +106,7 @@ class LinkWatch:
 
     def may_command(self, edge: str) -> bool:
         """Whether our own configuration lets questions on ``control`` of this edge out at all."""
-        return self.rights.allow_somebody(
-            flow="egress", message="query", key=EdgeKeys(edge).key(Channel.CONTROL)
-        )
+        return self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge)[Channel.CONTROL])
 
     def __enter__(self) -> Self:
         return self

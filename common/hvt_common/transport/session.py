@@ -115,7 +115,7 @@ def declare_publisher(session: zenoh.Session, channel: Channel, *, keys: EdgeKey
     """A publisher of one channel, delivered as the key table says; ``put`` may block on a ``BLOCK`` channel."""
     delivery = DELIVERIES[channel]
     return session.declare_publisher(
-        keys.key(channel),
+        keys[channel],
         encoding=delivery.encoding,
         congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
         priority=getattr(zenoh.Priority, delivery.priority),
@@ -218,7 +218,7 @@ def query_later(
     handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(reply, on_end)
     delivery = DELIVERIES[channel]
     session.get(
-        keys.key(channel),
+        keys[channel],
         handler,
         payload=question,
         timeout=timeout_s,
@@ -241,7 +241,7 @@ def serve(
 
     ``declared_as`` is another expression for its key.
     """
-    key = keys.key(channel)
+    key = keys[channel]
 
     def reply(query: zenoh.Query) -> None:
         with query:

@@ -174,7 +174,7 @@ class EdgeListener:
         self._declared: dict[Channel, zenoh.Queryable[None] | zenoh.Subscriber[None]] = {}
         for channel in (Channel.INFO, Channel.CONTROL, Channel.FEEDBACK):
             self._declare(channel)
-        self._token = self.session.liveliness().declare_token(self.keys.key(Channel.ALIVE))
+        self._token = self.session.liveliness().declare_token(self.keys[Channel.ALIVE])
 
     def close(self) -> None:
         """Withdraw the token, so that grounds see the end."""
@@ -202,7 +202,7 @@ class EdgeListener:
         if channel in self._declared:
             self._declared[channel].undeclare()  # type: ignore[no-untyped-call]
             self._again[channel] += 1
-        key = another_key(self.keys.key(channel), channel, number=self._again[channel])
+        key = another_key(self.keys[channel], channel, number=self._again[channel])
         if channel is Channel.FEEDBACK:
             self._declared[channel] = self.session.declare_subscriber(key, self._on_feedback)
         else:

@@ -354,7 +354,7 @@ class Transmitter:
         video. Its bytes have an account of their own, since each ground sees only the answers that it requested.
         """
         overhead = overhead_bytes(
-            len(payload), 0, key=self._keys.key(channel), encoding=DELIVERIES[channel].encoding, reply=True
+            len(payload), 0, key=self._keys[channel], encoding=DELIVERIES[channel].encoding, reply=True
         )
         with self._lock:
             self.ledger.count_reply(len(payload) + overhead)
@@ -459,6 +459,6 @@ class Transmitter:
         return attachment_bytes + overhead_bytes(
             size_bytes,
             attachment_bytes,
-            key=self._keys.key(channel),
+            key=self._keys[channel],
             encoding=encoding or DELIVERIES[channel].encoding,
         )

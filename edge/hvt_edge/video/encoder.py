@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -55,6 +56,7 @@ STATUS_BYTES = 320
 """The size of a `Status`."""
 SLOWEST: Final = "veryfast"
 """The preset of studies, the demo and all of lockstep: there time does not matter."""
+_keys = lru_cache(maxsize=64)(EdgeKeys)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,12 +113,11 @@ def minimum_bps(size: tuple[int, int], fps: float) -> int:
 def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
     """The share of headers, framing and ``status`` in ``base_bps``: the encoder gets the rest."""
     payload = round(base_bps / 8 / fps)
-    key = EdgeKeys(edge_id).key(Channel.BASE)
-    encoding = DELIVERIES[Channel.BASE].encoding
+    keys, encoding = _keys(edge_id), DELIVERIES[Channel.BASE].encoding
     per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
-        payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
+        payload, BASE_ATTACHMENT_BYTES, key=keys[Channel.BASE], encoding=encoding
     )
-    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Channel.STATUS))
+    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=keys[Channel.STATUS])
     return 8 * (per_frame * fps + per_second)
 
 

@@ -150,7 +150,7 @@ class TrackRegions:
 
     def regions(self, tracks: Tracks | None) -> list[Region]:
         """Return the regions of the next frame, keyframe or not; ``tracks`` (base pixels) may be some frames old."""
-        if tracks is None or not len(tracks):
+        if tracks is None or not tracks.ids.size:
             return []
         best = np.argsort(-tracks.confidences, kind="stable")[:MOST_REGIONS]
         blocks = self._blocks(tracks.boxes_xyxy_px[np.sort(best)])

@@ -71,7 +71,7 @@ def messages_of(recorded: Recorded) -> Iterator[Received]:
         )
     make = _Recorded(info.edge, info.session_id)
     begins_ns = recorded.video[0].capture_ns if recorded.video else 0
-    first = Received(make.keys.key(Channel.INFO), info.pack(), b"", "", begins_ns)
+    first = Received(make.keys[Channel.INFO], info.pack(), b"", "", begins_ns)
     # Of one frame the pose is known first, and a still last.
     streams = (
         map(make.pose, recorded.poses),
@@ -92,7 +92,7 @@ class _Recorded:
 
     def pose(self, update: PoseUpdate) -> Received:
         report = self._poses.encode(update.pose)(update.capture_ns)
-        return Received(self.keys.key(Channel.POSE), report.pack(), b"", "", update.capture_ns)
+        return Received(self.keys[Channel.POSE], report.pack(), b"", "", update.capture_ns)
 
     def unit(self, sample: VideoSample) -> Received:
         """An access unit; those that never came are missed by their frames alone."""
@@ -109,13 +109,13 @@ class _Recorded:
             send_delay_ns=0,
             flags=flags,
         )
-        key = self.keys.key(Channel.BASE)
+        key = self.keys[Channel.BASE]
         return Received(key, sample.data, header.pack(sample.data), "video/h265", sample.capture_ns)
 
     def still(self, still: RecordedStill, header: RoiHeader) -> Received:
         """A still, at the time at which it was known; one that was stored has its picture here."""
         live = replace(header, flags=header.flags & ~Flags.STORED)
-        key = self.keys.key(Channel.ROI)
+        key = self.keys[Channel.ROI]
         return Received(key, still.jpeg, live.pack(still.jpeg), "image/jpeg", still.capture_ns)
 
 

@@ -255,7 +255,7 @@ class Watch(LinkWatch):
 
     def _writes(self, name: str) -> bool:
         try:
-            key = EdgeKeys(name).key(Channel.STATUS)
+            key = EdgeKeys(name)[Channel.STATUS]
         except UserError:
             return False
         return self.rights.allow(name, flow="ingress", message="put", key=key)

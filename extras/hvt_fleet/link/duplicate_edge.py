@@ -84,7 +84,7 @@ def _attempt(settings: LinkSettings, keys: EdgeKeys, patience: float) -> Info | 
 def _info(config: zenoh.Config, keys: EdgeKeys, *, answer_s: float) -> Info | None:
     try:
         with zenoh.open(config) as session:
-            tokens = session.liveliness().get(keys.key(Channel.ALIVE), timeout=answer_s)
+            tokens = session.liveliness().get(keys[Channel.ALIVE], timeout=answer_s)
             if not any(reply.ok is not None for reply in tokens):
                 return None
             answer = query(session, Channel.INFO, keys=keys, question=b"", timeout_s=answer_s)

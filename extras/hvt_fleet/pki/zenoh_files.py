@@ -95,15 +95,15 @@ def router_file(router: RouterMember, roster: Roster, *, folder: str = KEYS_FOLD
 
 def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
     keys = EdgeKeys(edge)
-    requested = [keys.key(Channel.INFO), *([keys.key(Channel.CONTROL)] if command else [])]
+    requested = [keys[Channel.INFO], *([keys[Channel.CONTROL]] if command else [])]
     return [
         _rule("subscribe", "egress", ["declare_subscriber"], [_EVERYBODY]),
         _rule("watch", "egress", ["declare_liveliness_subscriber", "liveliness_query"], [_EVERYBODY]),
         _rule(f"{edge}-publishes", "ingress", ["put"], _written([edge])),
         _rule(f"{edge}-answers", "ingress", ["declare_queryable", "reply"], _answered([edge])),
-        _rule(f"{edge}-is-present", "ingress", ["liveliness_token"], [keys.key(Channel.ALIVE)]),
-        _rule(f"{edge}-listens", "ingress", ["declare_subscriber"], [keys.key(Channel.FEEDBACK)]),
-        _rule(f"{edge}-is-told", "egress", ["put"], [keys.key(Channel.FEEDBACK)]),
+        _rule(f"{edge}-is-present", "ingress", ["liveliness_token"], [keys[Channel.ALIVE]]),
+        _rule(f"{edge}-listens", "ingress", ["declare_subscriber"], [keys[Channel.FEEDBACK]]),
+        _rule(f"{edge}-is-told", "egress", ["put"], [keys[Channel.FEEDBACK]]),
         _rule(f"{edge}-is-asked", "egress", ["query"], requested),
     ]
 
@@ -118,23 +118,21 @@ def _toward_ground(edges: Sequence[str], *, command: bool, label: str) -> list[_
         _rule("watched", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], [_EVERYBODY]),
         _rule(f"{label}-receives", "egress", ["put"], _written(edges)),
         _rule(f"{label}-hears-answers", "egress", ["declare_queryable", "reply"], _answered(edges)),
-        _rule(f"{label}-sees", "egress", ["liveliness_token"], [one.key(Channel.ALIVE) for one in keys]),
-        _rule(
-            f"{label}-is-heard", "egress", ["declare_subscriber"], [one.key(Channel.FEEDBACK) for one in keys]
-        ),
-        _rule(f"{label}-reports", "ingress", ["put"], [one.key(Channel.FEEDBACK) for one in keys]),
-        _rule(named, "ingress", ["query"], [one.key(row) for one in keys for row in requested]),
+        _rule(f"{label}-sees", "egress", ["liveliness_token"], [one[Channel.ALIVE] for one in keys]),
+        _rule(f"{label}-is-heard", "egress", ["declare_subscriber"], [one[Channel.FEEDBACK] for one in keys]),
+        _rule(f"{label}-reports", "ingress", ["put"], [one[Channel.FEEDBACK] for one in keys]),
+        _rule(named, "ingress", ["query"], [one[row] for one in keys for row in requested]),
     ]
 
 
 def _written(edges: Sequence[str]) -> list[str]:
     rows = [row for row in Channel if DELIVERIES[row].direction is Direction.EDGE_TO_GROUND]
-    return [EdgeKeys(edge).key(row) for edge in edges for row in rows]
+    return [EdgeKeys(edge)[row] for edge in edges for row in rows]
 
 
 def _answered(edges: Sequence[str]) -> list[str]:
     rows = [row for row in Channel if DELIVERIES[row].direction is Direction.GROUND_QUERIES]
-    return [EdgeKeys(edge).key(row) for edge in edges for row in rows]
+    return [EdgeKeys(edge)[row] for edge in edges for row in rows]
 
 
 def _rule(name: str, flow: str, messages: Sequence[str], key_exprs: Sequence[str]) -> _Rule:

@@ -283,7 +283,7 @@ class Reception:
             _ACCOUNTS.get(row, Account.META),
             payload_bytes=size,
             attachment_bytes=extra,
-            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
+            overhead_bytes=overhead_bytes(size, extra, key=self._keys[row], encoding=item.encoding),
             at_ns=at_ns,
         )
 

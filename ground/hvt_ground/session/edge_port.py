@@ -109,7 +109,7 @@ class EdgePort:
         def note(data: bytes) -> None:
             answered_ns = self.clock()
             if self.log is not None:
-                self.log(Received(self._keys.key(Channel.INFO), data, b"", "", answered_ns))
+                self.log(Received(self._keys[Channel.INFO], data, b"", "", answered_ns))
             try:
                 info = Info.parse(data)
             except WireError as error:

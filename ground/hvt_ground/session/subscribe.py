@@ -139,7 +139,7 @@ class GroundLink:
         # Make the new one first, and keep the last one: the declaration of the new may be lost on the way, while the
         # withdrawal of the old arrives.
         own = self._subscribers.setdefault(edge, {})
-        new = self._declare(another_key(EdgeKeys(edge).key(row), row, number=number), number=number)
+        new = self._declare(another_key(EdgeKeys(edge)[row], row, number=number), number=number)
         self._newest[edge, row] = number
         former = own.get(row, [])
         own[row] = [new, *former[:1]]

@@ -239,7 +239,7 @@ class GroundSide:
             backlog=(),
             objects_detected=self._session.pipeline.objects_detected,
         ).pack()
-        key, encoding = EdgeKeys(self._info.edge).key(Channel.FEEDBACK), DELIVERIES[Channel.FEEDBACK].encoding
+        key, encoding = EdgeKeys(self._info.edge)[Channel.FEEDBACK], DELIVERIES[Channel.FEEDBACK].encoding
         return len(payload) + overhead_bytes(len(payload), 0, key=key, encoding=encoding)
 
     def _picture(self, header: BaseHeader, arrival: Arrival[Received]) -> None:

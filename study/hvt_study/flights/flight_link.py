@@ -211,7 +211,7 @@ class FlightOutlet:
     ) -> None:
         """Hand over one message at the time that it says itself."""
         attached = attachment or b""
-        key = self._keys.key(channel)
+        key = self._keys[channel]
         size_bytes = (
             len(payload)
             + len(attached)

@@ -37,7 +37,7 @@ class UnitMessage:
 def header_bps(line_bps: float, *, units_per_s: float, messages_per_s: float, row: Channel) -> float:
     """The part of headers and transport in ``line_bps``."""
     payload = round(line_bps / 8 / messages_per_s)
-    around = HEADER_BYTES + overhead_bytes(payload, HEADER_BYTES, key=_KEYS.key(row), encoding=_VIDEO)
+    around = HEADER_BYTES + overhead_bytes(payload, HEADER_BYTES, key=_KEYS[row], encoding=_VIDEO)
     return 8 * (messages_per_s * around + (units_per_s - messages_per_s) * _FURTHER.size)
 
 
@@ -123,7 +123,7 @@ class Line:
         )
 
     def _weight(self, row: Channel, payload: bytes, attachment: bytes, *, encoding: str) -> int:
-        key = _KEYS.key(row)
+        key = _KEYS[row]
         around = overhead_bytes(len(payload), len(attachment), key=key, encoding=encoding)
         return len(payload) + len(attachment) + around
 

@@ -108,7 +108,7 @@ def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
     assert after(10, there=False) == (0, 0, 0)
     assert after(7, there=True) == (3, 2, 2)
     for (channel, _), key in zip(declared, keys, strict=True):
-        met = {one for one in Channel if zenoh.KeyExpr(key).intersects(EdgeKeys("uav-1").key(one))}
+        met = {one for one in Channel if zenoh.KeyExpr(key).intersects(EdgeKeys("uav-1")[one])}
         assert met == {channel}
     assert len(set(keys)) == len(keys), "a key whose number was lost is never understood again"
     answer = next(answer for channel, answer in reversed(declared) if channel is Channel.INFO)

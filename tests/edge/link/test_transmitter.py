@@ -45,7 +45,7 @@ class Out(Puts):
         return sum(
             len(payload)
             + len(attachment)
-            + overhead_bytes(len(payload), len(attachment), key=keys.key(row), encoding=encoding)
+            + overhead_bytes(len(payload), len(attachment), key=keys[row], encoding=encoding)
             for row, payload, attachment, encoding in self.puts
         )
 

@@ -134,7 +134,7 @@ def test_the_overhead_that_is_reckoned_with_is_the_real_one():
         one = replace(ROI, session_id=2**63, box_source_px=box, reason="gain", parameters={}, also=objects)
         return len(one.pack(b"x" * 1000))
 
-    framing = overhead_bytes(1000, header(0), key=EdgeKeys("edge-1").key(Channel.ROI), encoding="image/jpeg")
+    framing = overhead_bytes(1000, header(0), key=EdgeKeys("edge-1")[Channel.ROI], encoding="image/jpeg")
     assert header(0) + framing == pytest.approx(STILL_OVERHEAD_BYTES, abs=15)
     assert (header(8) - header(0)) / 8 == pytest.approx(ALSO_BYTES, abs=1)
 

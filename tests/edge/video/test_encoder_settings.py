@@ -36,9 +36,9 @@ def line_bits(pictures, settings: EncoderSettings, *, keyframes=KEYFRAMES) -> li
     for frame in framed(pictures):
         data = encoder.encode(frame, keyframe=frame.index in keyframes).data
         header = BASE_ATTACHMENT_BYTES - 8
-        around = header + overhead_bytes(len(data), header, key=key.key(Channel.BASE), encoding="video/h265")
+        around = header + overhead_bytes(len(data), header, key=key[Channel.BASE], encoding="video/h265")
         if frame.index % FPS == 0:
-            around += STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=key.key(Channel.STATUS))
+            around += STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=key[Channel.STATUS])
         bits.append(8 * (len(data) + around))
     return bits
 

@@ -204,14 +204,14 @@ def test_with_keys_grounds_form_a_group_and_edges_take_no_part(tmp_path):
         open_session(fleet.settings("other", "ground", connect=(endpoint,))) as other,
         open_session(fleet.settings("uav-1", "edge", connect=(endpoint,))) as edge,
     ):
-        alive = edge.liveliness().declare_token(EdgeKeys("uav-1").key(Channel.ALIVE))
+        alive = edge.liveliness().declare_token(EdgeKeys("uav-1")[Channel.ALIVE])
         stolen = edge.liveliness().declare_token(GroupKeys("north").member("zz-stolen"))
         with (
             GroundGroup(base, "north", member="base-a") as first,
             GroundGroup(other, "north", member="base-b") as second,
         ):
             eventually(lambda: first.members == second.members == ("base-a", "base-b"), what="both know")
-            token = EdgeKeys("uav-1").key(Channel.ALIVE)
+            token = EdgeKeys("uav-1")[Channel.ALIVE]
             eventually(
                 lambda: [one.ok for one in base.liveliness().get(token, timeout=2)],
                 what="the edge is there",

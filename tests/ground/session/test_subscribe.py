@@ -152,7 +152,7 @@ def test_a_ground_says_which_stills_it_reads(link):
     queryable = serve(
         outsider, Channel.INFO, keys=keys, answer=lambda question: questions.append(question) or INFO.pack()
     )
-    with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
+    with outsider.liveliness().declare_token(keys[Channel.ALIVE]):
         eventually(lambda: served(ground) == {"uav-1"}, what="it is served")
         (port,) = ground.ports()
         for count in (1, 2):
@@ -356,8 +356,8 @@ def test_an_edge_that_a_lost_subscription_keeps_silent_is_subscribed_to_again() 
     assert gone == own[:6], "the edge may know no others than those before the last"
 
     def met_by(key: str) -> Channel:
-        (met,) = [one for one in Channel if zenoh.KeyExpr(key).intersects(EdgeKeys("uav-1").key(one))]
-        assert not zenoh.KeyExpr(key).intersects(EdgeKeys("uav-2").key(met))
+        (met,) = [one for one in Channel if zenoh.KeyExpr(key).intersects(EdgeKeys("uav-1")[one])]
+        assert not zenoh.KeyExpr(key).intersects(EdgeKeys("uav-2")[met])
         return met
 
     rows = list(map(met_by, own[:6]))

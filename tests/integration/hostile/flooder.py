@@ -161,7 +161,7 @@ def say(
     end_s, said, size_bytes = time.monotonic() + seconds, 0, 0
     for row, payload, attachment in KINDS[kind](heard):
         session.put(
-            keys.key(row), payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK
+            keys[row], payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK
         )
         said += 1
         size_bytes += len(payload)
@@ -187,7 +187,7 @@ def ask(session: zenoh.Session, keys: EdgeKeys, *, seconds: float) -> dict[str, 
         answered += 1
 
     while time.monotonic() < end_s:
-        session.get(keys.key(Channel.CONTROL), heard, payload=questions[said % len(questions)], timeout=1.0)
+        session.get(keys[Channel.CONTROL], heard, payload=questions[said % len(questions)], timeout=1.0)
         said += 1
     time.sleep(1.2)
     return {"said": said, "answered": answered}

@@ -130,7 +130,7 @@ def _edge(fleet: Fleet, endpoint: str, *, name: str = "uav-1") -> Iterator[zenoh
     with open_session(settings) as session:
         serve(session, Channel.INFO, keys=UAV1, answer=lambda _question: b"info")
         serve(session, Channel.CONTROL, keys=UAV1, answer=lambda _question: b"done")
-        token = session.liveliness().declare_token(UAV1.key(Channel.ALIVE))
+        token = session.liveliness().declare_token(UAV1[Channel.ALIVE])
         with Watch(session, settings, served=lambda _ground: False, patience_s=PATIENCE_S):
             yield session
         token.undeclare()  # type: ignore[no-untyped-call]
@@ -164,17 +164,17 @@ def test_an_edge_cannot_write_as_another(
                 patience_s=PATIENCE_S,
             )
         )
-        forger.liveliness().declare_token(UAV2.key(Channel.ALIVE))
+        forger.liveliness().declare_token(UAV2[Channel.ALIVE])
         serve(forger, Channel.INFO, keys=UAV2, answer=lambda _question: b"forged")
         own = declare_publisher(forger, Channel.STATUS, keys=UAV1)
         eventually(lambda: own.matching_status.matching, what="the edge's own stream is wanted")
         for row in (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.STATUS, Channel.FEEDBACK):
-            forger.put(UAV2.key(row), b"forged")
+            forger.put(UAV2[row], b"forged")
         own.put(b"own")
         eventually(lambda: came, what="the edge's own message")
         assert query(ground, Channel.INFO, keys=UAV2, question=b"", timeout_s=1) is None
         eventually(lambda: "'uav-1' is linked" in caplog.text, what="the ground is told")
-        assert came == [UAV1.key(Channel.STATUS)]
+        assert came == [UAV1[Channel.STATUS]]
     assert "or it runs under another id than its certificate says, and all it sends is dropped" in caplog.text
 
 

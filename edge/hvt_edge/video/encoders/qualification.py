@@ -141,7 +141,7 @@ def _coded(encoder: Encoder, scene: Iterable[Frame], *, middle: int) -> list[Acc
 
 
 def line_bytes(payload: int, edge_id: str) -> int:
-    key, encoding = EdgeKeys(edge_id).key(Channel.BASE), DELIVERIES[Channel.BASE].encoding
+    key, encoding = EdgeKeys(edge_id)[Channel.BASE], DELIVERIES[Channel.BASE].encoding
     around = overhead_bytes(payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding)
     return payload + BASE_ATTACHMENT_BYTES + around
 

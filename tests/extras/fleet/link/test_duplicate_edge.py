@@ -58,8 +58,8 @@ def edge(
             return info
 
         serve(session, Channel.INFO, keys=KEYS, answer=answer)
-        token = session.liveliness().declare_token(KEYS.key(Channel.ALIVE))
-        eventually(lambda: list(ground.liveliness().get(KEYS.key(Channel.ALIVE), timeout=20.0)))
+        token = session.liveliness().declare_token(KEYS[Channel.ALIVE])
+        eventually(lambda: list(ground.liveliness().get(KEYS[Channel.ALIVE], timeout=20.0)))
         leaver = threading.Thread(target=lambda: left.wait(60) and token.undeclare(), daemon=True)
         leaver.start()
         yield left
