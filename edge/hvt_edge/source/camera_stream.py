@@ -168,8 +168,8 @@ class CameraDecoder:
         self._units = units
         self._decoder = BaseDecoder()  # of any size: with a size it would only fail at a larger picture
         self._size: tuple[int, int] | None = None
-        self._whole = False
-        """Whether all units since a keyframe were decoded."""
+        self.whole = False
+        """Whether all units since a keyframe were decoded; read by other threads too."""
         self.trouble = ""
         """The fault of the newest unit that was left out, in a few words."""
         self.is_other = False
@@ -181,7 +181,7 @@ class CameraDecoder:
 
     def skip(self) -> None:
         """Note that packets are missing before the next one."""
-        self._whole = False
+        self.whole = False
 
     def decode(self, packet: bytes) -> tuple[CameraUnit, YuvPicture] | None:
         """The unit and its picture; None where it cannot be sent."""
@@ -190,9 +190,9 @@ class CameraDecoder:
         except ValueError as error:
             self._leave_out(str(error))
             return None
-        if not unit.keyframe and not self._whole:
+        if not unit.keyframe and not self.whole:
             return None
-        if unit.keyframe and not self._whole:
+        if unit.keyframe and not self.whole:
             self._decoder.reset()
         picture = self._decoder.decode_yuv(unit.data)
         if picture is None:
@@ -204,11 +204,11 @@ class CameraDecoder:
         if self._size is not None and picture.size != self._size:
             self._leave_out(f"a picture has {picture.size[0]}x{picture.size[1]} pixels", is_other=True)
             return None
-        self._whole = True
+        self.whole = True
         return unit, picture
 
     def _leave_out(self, why: str, *, is_other: bool = False) -> None:
-        self._whole, self.trouble, self.is_other = False, why, is_other
+        self.whole, self.trouble, self.is_other = False, why, is_other
 
 
 def open_units(name: str, stream: Any) -> CameraUnits:

@@ -27,7 +27,14 @@ from hvt_edge.source.camera_stream import (
 )
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, SourceSettings
 from hvt_edge.source.live import IDLE_S, SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
-from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, packets_of
+from hvt_edge.source.stream import (
+    FIRST_S,
+    NO_PICTURE,
+    StreamGrabber,
+    camera_time_ns,
+    is_stamped,
+    packets_of,
+)
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 """A camera is surveyed before the flight until its second keyframe, within these bounds."""
@@ -53,8 +60,12 @@ class CodedStreamGrabber(StreamGrabber):
 
 
 def _packets(container: Any, stream: Any, decoder: CameraDecoder) -> Iterator[Shot]:
-    stamped = is_stamped(container)
+    stamped, until_s = is_stamped(container), time.monotonic() + FIRST_S
     for packet in packets_of(container, stream):
+        if decoder.whole:
+            until_s = time.monotonic() + FIRST_S
+        elif time.monotonic() > until_s:  # a new connection begins with a keyframe
+            raise SignalLost(NO_PICTURE)
         if packet.size:
             at_s = None if packet.pts is None else float(packet.pts * packet.time_base)
             taken = CameraPacket(bytes(packet), at_s, decoder)

@@ -27,8 +27,9 @@ from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
 _OPEN_S = 10.0
-_UNDECODED_S, _FIRST_S = 10.0, 30.0
+_UNDECODED_S, FIRST_S = 10.0, 30.0
 """Longest time without a picture while packets come, and before the first: x264 sends each 250 one a keyframe."""
+NO_PICTURE = "what it sends gives no picture: does a keyframe come?"
 _MOST_TIMES = 64
 
 _NEVER = (
@@ -142,7 +143,7 @@ def is_stamped(container: Any) -> bool:
 def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     # Undecodable packets are left out: joined between keyframes, or losses.
     times: dict[Fraction, int] = {}
-    until_s, stamped = time.monotonic() + _FIRST_S, is_stamped(container)
+    until_s, stamped = time.monotonic() + FIRST_S, is_stamped(container)
     for packet in packets_of(container, stream):
         camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
@@ -153,7 +154,7 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
         if decoded:
             until_s = time.monotonic() + _UNDECODED_S
         elif time.monotonic() > until_s:
-            raise SignalLost("what it sends gives no picture: does a keyframe come?")
+            raise SignalLost(NO_PICTURE)
         for coded in decoded:
             for frame in pictures.frames(coded):
                 base = frame.time_base

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import NotYetError, UserError
-from hvt_edge.source import stream
+from hvt_edge.source import coded_live, stream
 from hvt_edge.source.coded_live import CodedStreamGrabber
 from hvt_edge.source.live import SignalLost
 from hvt_edge.source.opening import open_source
@@ -102,22 +102,25 @@ def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(tmp_path, m
         sender.join()
 
 
-def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch):
+@pytest.mark.parametrize(("grabber", "codec"), [(StreamGrabber, "libx264"), (CodedStreamGrabber, "libx265")])
+def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch, grabber, codec):
     """The edge waited for ever, without a word: H.264 without its keyframe is no error to FFmpeg."""
     seconds = itertools.count()
-    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
+    clock = SimpleNamespace(monotonic=lambda: next(seconds) / 4)
+    monkeypatch.setattr(stream, "time", clock)
+    monkeypatch.setattr(coded_live, "time", clock)
     data = io.BytesIO()
     with av.open(data, "w", format="matroska") as output:
-        film = output.add_stream("libx264", rate=25, options={"tune": "zerolatency", "g": "1000"})
+        film = output.add_stream(codec, rate=25, options={"tune": "zerolatency", "g": "1000"})
         film.width, film.height, film.pix_fmt = 128, 64, "yuv420p"
         packets = [one for _ in range(200) for one in film.encode(av.VideoFrame(128, 64, "yuv420p"))]
         output.mux(packets[1:])
     connection = av.open(io.BytesIO(data.getvalue()))
     monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)
-    camera = StreamGrabber("tcp://camera")
+    camera = grabber("tcp://camera")
     camera.open()
     with pytest.raises(SignalLost, match="does a keyframe come"):
-        camera.grab()
+        all(iter(camera.grab, None))
     camera.close()
 
 
