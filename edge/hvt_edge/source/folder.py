@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -26,7 +27,8 @@ _log = logging.getLogger(__name__)
 
 _MOSTLY = 0.5
 """Share of the steps from one number to the next that must be 1 for others to be gaps."""
-_ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"})
+_NAMED = ".jpg .jpeg .jpe .jfif .png .bmp .webp .tif .tiff .jp2 .pgm .ppm .pnm"
+_ENDINGS = frozenset(_NAMED.split())
 
 
 def sequence_files(folder: Path) -> list[Path]:
@@ -76,6 +78,13 @@ def _gaps(files: list[Path]) -> str:
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
+def _left_out(folder: Path) -> str:
+    found = [file for file in folder.glob("[!.]*") if file.is_file() and not names_picture(file)]
+    counts = Counter(file.suffix.lower() or "without one" for file in found)
+    said = ", ".join(f"{count} {ending}" for ending, count in sorted(counts.items()))
+    return said and f"files are left out by their endings: {said}"
+
+
 def _pages(file: Path) -> str:
     # A note that a file holds more than one picture; empty where it does not.
     count = 0
@@ -107,7 +116,7 @@ class FolderSource(Source):
             raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
         notes = Notes(spec)
         self._stretch = Stretch(notes)
-        images = ((_bgr(file, self._stretch, at_s=0.0), file) for file in self._files)
+        images = ((read_picture(file, self._stretch), file) for file in self._files)
         first, shown = next((one for one in images if one[0] is not None), (None, Path(spec)))
         if first is None:
             raise UserError(
@@ -116,6 +125,7 @@ class FolderSource(Source):
         if settings.source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
         notes(_gaps(self._files))
+        notes(_left_out(self._place))
         notes(_pages(shown))
         self.notes = notes.taken()
         self._first = first
@@ -143,7 +153,7 @@ class FolderSource(Source):
                 _log.warning("%s: %d images came after the start and are not shown", self._place, more)
 
     def _readable(self, place: int, *, held: Image) -> Image:
-        image = _bgr(self._files[place], self._stretch, at_s=float(place * self._period_s))
+        image = read_picture(self._files[place], self._stretch, at_s=float(place * self._period_s))
         if image is None:
             other = "first that can" if held is self._first else "one before"
             _log.warning(
@@ -152,15 +162,19 @@ class FolderSource(Source):
         return held if image is None else image
 
 
-def _bgr(file: Path, stretch: Stretch, *, at_s: float) -> Image | None:
-    # ``at_s`` is the time at which it is shown. Deep grey is a sensor's levels.
+def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.0) -> Image | None:
+    """(height, width, 3) uint8 BGR, turned by its EXIF data; None where it is no picture that can be read.
+
+    Deep grey is a sensor's levels: ``stretch`` has those of the pictures before; ``at_s`` is the time at which it is
+    shown, in seconds.
+    """
     try:
         data = np.fromfile(file, np.uint8)
         if not data.size:
             return None
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
         if image is not None and image.itemsize > 1 and image.ndim == 2:
-            return stretch.bgr(image, at_s=at_s)
+            return (stretch or Stretch(lambda _: None)).bgr(image, at_s=at_s)
         # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     except (OSError, cv2.error):  # it has just gone, or its header claims too large a size

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from hvt_common.errors import FlightError, NotYetError, UserError, absent
+from hvt_common.errors import FlightError, NotYetError, UserError, absent, named_path
 from hvt_common.redaction import HIDDEN, redacted
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -67,6 +67,8 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         _check_coded(spec)
     if is_demo(spec):
         return DemoSource(spec, settings, seed=seed)
+    if spec.startswith("~") and not _is_there(spec):  # no shell replaces it in --source=~/clip.mp4
+        spec = str(named_path(spec, name="source"))
     spec = spec if is_local(spec) else with_small_scheme(spec)
     scheme = "" if is_local(spec) else spec.partition("://")[0]
     if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
@@ -114,12 +116,14 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
         known = scheme if re.fullmatch(r"[a-z][a-z0-9+.-]{0,15}", scheme) else HIDDEN
         raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
     if not _is_there(spec):
-        if not growing and absent(Path(spec)) is NotYetError:
+        mistyped = not re.match(r"/[^/]", spec) and shown(spec) != spec
+        if not growing and not mistyped and absent(Path(spec)) is NotYetError:
             raise FlightError(
                 f"source {shown(spec)!r} is in a folder that does not exist: is its disk mounted?"
             )
-        kind = NotYetError if growing else UserError
-        raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
+        kind = NotYetError if growing and not mistyped else UserError
+        hint = ", and an address has a scheme and two slashes" * mistyped
+        raise kind(f"source {shown(spec)!r} does not exist{hint}; accepted is {_ACCEPTED}")
     if growing and Path(spec).is_file() and not Path(spec).stat().st_size:
         raise NotYetError(f"source {spec!r} is empty so far")
 

@@ -19,6 +19,7 @@ import time
 from fractions import Fraction
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
+from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
@@ -260,6 +261,15 @@ def test_another_size_among_images_is_fitted_into_the_first_ones(tmp_path):
     assert frames[1].source_bgr.shape == (100, 200, 3)
     assert (frames[1].source_bgr[:, 50:150] == 92).all()
     assert not frames[1].source_bgr[:, :50].any()
+
+
+def test_files_that_are_no_pictures_by_their_names_are_said(tmp_path):
+    """Photographs of a phone among the others were left out without a word."""
+    for name in ("1.jfif", "2.HEIC", "3.heic", "4.avif", ".hidden", "README"):
+        (tmp_path / name).write_bytes(cv2.imencode(".jpg", painted(1))[1])
+    source, _ = play(str(tmp_path))
+    assert source.frame_count == 1
+    assert "left out by their endings: 1 .avif, 2 .heic, 1 without one" in source.notes[-1]
 
 
 def test_a_folder_that_may_not_be_read_is_said(tmp_path, monkeypatch):
@@ -596,6 +606,27 @@ def test_missing_and_unusable_files_are_one_sentence(tmp_path):
     assert "noise.mp4" in refused(str(noise))
     assert "no images" in refused(str(bare))
     assert "none of which" in refused(str(broken))
+
+
+@pytest.mark.parametrize("spec", ["rtsp:/cam/1", "http:/10.0.0.5/a", "10.0.0.5:554/stream", "rtsp//cam/1"])
+def test_an_address_with_a_slip_is_no_disk_that_may_come(spec):
+    """It was waited for with exit code 1, and a disk was asked for."""
+    assert "does not exist, and an address has a scheme and two slashes" in refused(spec)
+
+
+def test_a_users_folder_is_found(tmp_path, monkeypatch):
+    """No shell replaces the ~ in --source=~/clip.mp4: a disk was asked for."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    write_clip(tmp_path / "a.mp4", count=2)
+    assert play("~/a.mp4")[0].frame_count == 1
+    assert "a user that this machine does not know" in refused("~nobody-here/a.mp4")
+
+
+def test_a_phones_photograph_is_refused(tmp_path):
+    """It is made of tiles, and one of them was flown."""
+    clip = Path(write_clip(tmp_path / "a.mp4", count=2))
+    clip.write_bytes(clip.read_bytes().replace(b"isom", b"heic", 1))
+    assert "is a HEIC picture: convert it to JPEG" in refused(str(clip))
 
 
 def test_a_sound_file_is_no_video(tmp_path):

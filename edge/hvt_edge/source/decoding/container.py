@@ -28,6 +28,8 @@ _log = logging.getLogger(__name__)
 _TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
 """FFmpeg plays text files as a terminal's screen; no user means that."""
 _PICTURE_CODECS = frozenset({"mjpeg", "png", "bmp", "gif", "tiff", "webp", "jpegxl"})
+_HEIF_BRANDS = frozenset({"heic", "heix", "heim", "heis", "mif1"})
+"""A phone's photograph is made of tiles, of which each is a stream to PyAV."""
 _NO_FILM = Disposition.attached_pic | Disposition.still_image | Disposition.timed_thumbnails
 _OPEN_S, _READ_S = 10.0, 10.0
 _THREAD_PX, _THREAD_FPS = 1280 * 720, 30
@@ -50,7 +52,7 @@ DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
 """A sender of MPEG-TS that begins anew may number its film otherwise: it is the same film to a viewer."""
 _FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0", "m3u8_hold_counters": "3"}
 """An HLS playlist whose recorder has ended is read from its beginning, and polled thrice for more."""
-_PLAYLIST = ".m3u8"
+_PLAYLIST, _IN_SEGMENTS = ".m3u8", "hls"
 _WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
 _TS_BYTES = (188, 192, 204)
@@ -117,10 +119,12 @@ def open_video(
             else f"source {name!r} is not a video that can be read ({cause_of(error)}); accepted is any video file "
             "that FFmpeg decodes"
         ) from None
-    stream = choose_stream(container, note=note)
+    is_heif = container.metadata.get("major_brand") in _HEIF_BRANDS
+    stream = None if is_heif else choose_stream(container, note=note)
     if stream is None:
         container.close()
-        raise refusal(f"source {name!r} holds no video; accepted is any video file that FFmpeg decodes")
+        holds = "is a HEIC picture: convert it to JPEG" if is_heif else "holds no video"
+        raise refusal(f"source {name!r} {holds}; accepted is any video file that FFmpeg decodes")
     stream.thread_type = "AUTO"
     codec = stream.codec_context
     # Each thread decodes a picture of its own, and holds it and its reference pictures.
@@ -238,14 +242,17 @@ def decoded(
     reading = _Reading(container, stream)
     before_s: Fraction | None = None
     paused = False
+    segments = container.format.name == _IN_SEGMENTS
+    pause_s = max(1 if segments else LONG_STEP_S, 3 * stamps.period_s)
     for frame in reading.frames():
         stamp = frame.pts if stamps.ordered else frame.dts
         jumped = bool(timeline.jumps)
         at_s = timeline.at(_seconds(stamp, frame.time_base) if stamps.usable else None)
-        if not paused and before_s is not None and at_s - before_s > max(LONG_STEP_S, 3 * stamps.period_s):
+        if not paused and before_s is not None and at_s - before_s > pause_s:
             paused = True
             pause = f"{float(at_s - before_s):.1f} s at {float(before_s):.1f} s"
-            _log.warning("%s: its picture stands for %s, as its time stamps say", name, pause)
+            why = "is a segment missing?" if segments else "as its time stamps say"
+            _log.warning("%s: its picture stands for %s, %s", name, pause, why)
         before_s = at_s
         yield at_s, frame
         if timeline.jumps and not jumped:
@@ -319,11 +326,12 @@ class _Reading:
         if (why := self._lacks_pictures()) or container.format.name == "mpegts":
             return why
         # The container's duration may be that of the sound.
-        said_s = duration_s(stream) if stream.duration or len(container.streams) == 1 else None
+        whole = stream.duration or len(container.streams) == 1 or container.format.name == _IN_SEGMENTS
+        said_s = duration_s(stream) if whole else None
         if said_s is not None and self.end_s is not None:
             missing_s = said_s - (self.end_s - self._begin_s)
             if missing_s > 1 and missing_s > said_s / 50:
-                return f"it ends {float(missing_s):.1f} s before the end that its header says"
+                return f"it is {float(missing_s):.1f} s shorter than its header says"
         return ""
 
     def _frames_there(self) -> int:
@@ -339,7 +347,7 @@ class _Reading:
         joined = sum(kind == b"moov" for kind, _ in boxes) > 1
         if joined and not self._stream.frames:
             return "another recording is behind it, in fragments that FFmpeg takes for those of the first"
-        for before, later in pairwise(number for kind, number in boxes if kind == b"moof"):
+        for before, later in pairwise([1, *(number for kind, number in boxes if kind == b"moof")]):
             if later > before + 1 and not joined:
                 return f"its fragments are not in a row: number {later} follows {before}"
         ends = name in _WITHOUT_INDEX or joined

@@ -94,13 +94,26 @@ def test_fragments_of_another_recording_are_said(tmp_path, caplog):
     assert "both.mp4 is unfinished: another recording is behind it" in caplog.text
 
 
-def test_a_fragment_that_is_missing_is_said(tmp_path, caplog):
-    """The picture stood still, without a word, where an upload had lost a part."""
+@pytest.mark.parametrize("missing", [slice(2), slice(1, 2)])
+def test_a_fragment_that_is_missing_is_said(tmp_path, caplog, missing):
+    """The picture stood still, or began late, without a word, where an upload had lost a part."""
     write(tmp_path / "a.mp4", range(60), movflags="frag_keyframe+empty_moov+default_base_moof")
     head, *fragments = (tmp_path / "a.mp4").read_bytes().split(b"moof")
-    (tmp_path / "a.mp4").write_bytes(b"moof".join([head, fragments[0], *fragments[2:]]))
+    del fragments[missing]
+    (tmp_path / "a.mp4").write_bytes(b"moof".join([head, *fragments]))
     play(tmp_path / "a.mp4")
     assert "a.mp4 is unfinished: its fragments are not in a row: number 3 follows 1" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("missing", "says"), [(0, "it is 2.0 s shorter than its header says"), (1, "stands for 2.0 s")]
+)
+def test_a_segment_that_is_missing_is_said(tmp_path, caplog, missing, says):
+    """FFmpeg goes on with the next: the picture stood still, or the film began late, without a word."""
+    write(tmp_path / "a.m3u8", range(180), group=60, hls_time="2", hls_list_size="0")
+    (tmp_path / f"a{missing}.ts").unlink()
+    play(tmp_path / "a.m3u8")
+    assert says in caplog.text
 
 
 def test_another_codec_in_the_midst_is_not_called_damage_alone(tmp_path, caplog):
