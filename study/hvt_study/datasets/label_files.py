@@ -31,7 +31,7 @@ from hvt_common import files
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import numbered_names, read_labels
 from hvt_common.values import Image
-from hvt_edge.source.folder import sequence_files
+from hvt_edge.source.folder import read_picture, sequence_files
 from hvt_study.datasets.annotation_rows import label_text
 from hvt_study.datasets.labels import FrameLabels, LabelDoubts
 
@@ -107,12 +107,13 @@ def read_image(path: Path, labelled_size: tuple[int, int] | None = None) -> Imag
 
     It is turned as its EXIF tag says, but where it was labelled as it lies (``labelled_size``).
     """
-    name: Any = os.fsencode(path)  # OpenCV dies of a text that is no UTF-8
-    image = cv2.imread(name, cv2.IMREAD_COLOR)
+    image = read_picture(path)
     if image is not None and labelled_size and labelled_size == image.shape[:2] != image.shape[1::-1]:
+        name: Any = os.fsencode(path)  # OpenCV dies of a text that is no UTF-8
         lying = cv2.imread(name, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        image = lying if lying is not None and lying.shape[:2] == labelled_size[::-1] else image
-    return None if image is None else np.asarray(image, np.uint8)
+        if lying is not None and lying.shape[:2] == labelled_size[::-1]:
+            return np.asarray(lying, np.uint8)
+    return image
 
 
 def label_file(picture: Path, place: Path, folders: Folders) -> Path | None:
@@ -146,7 +147,7 @@ def class_file(place: Path, pictures: list[Path]) -> Path | None:
         for name in _CLASSES:
             if (folder / name).is_file():
                 return folder / name
-    return next(iter(sorted(place.glob("*.yaml"))), None)
+    return next(iter(sorted(place.glob("[!.]*.yaml"))), None)
 
 
 def read_class_file(path: Path) -> tuple[str, ...]:
@@ -163,9 +164,9 @@ def coco_files(place: Path) -> list[Path]:
     """COCO's files of a set: those of usual names, and of ``annotations/``."""
     folders = _folders(place, 1)
     found = [folder / name for folder in folders for name in _COCO if (folder / name).is_file()]
-    files = sorted((place / "annotations").glob("*.json"))
+    files = sorted((place / "annotations").glob("[!.]*.json"))
     found += [one for one in files if one.name.startswith(_COCO_BOXES)] or files
-    return found or [one for one in sorted(place.glob("*.json")) if _is_coco(one)]
+    return found or [one for one in sorted(place.glob("[!.]*.json")) if _is_coco(one)]
 
 
 def _is_coco(path: Path) -> bool:

@@ -456,6 +456,7 @@ def test_clips_say_what_a_frame_shows(tmp_path, ending, fps):
     """Reference labels are kept by source frame; those of another frame would be of another picture."""
     _write_video(tmp_path / f"road.{ending}", 24, fps=fps)
     (tmp_path / "notes.txt").write_text("no video")
+    (tmp_path / f"._road.{ending}").write_text("a Mac's note on it")
     (sequence,) = open_dataset(f"clips:{tmp_path}")
     assert (sequence.name, sequence.frame_count, sequence.fps) == ("road", 24, fps)
     assert (sequence.labels, sequence.class_set) == (None, ())

@@ -493,6 +493,29 @@ def test_a_coco_file_of_any_name_is_found(tmp_path: Path) -> None:
     assert len(labels) == 1
 
 
+@pytest.mark.parametrize("place", ["annotations/ours.json", "ours.yaml"])
+def test_a_macs_notes_on_files_are_none_of_the_set(tmp_path: Path, place: str) -> None:
+    """Copied by a Mac, each file has one beside it that comes first: the set was refused."""
+    picture(tmp_path / "images/a.jpg")
+    is_coco = place.endswith("json")
+    note = text(tmp_path / place, coco() if is_coco else "names: [car, bus]\n")
+    text(note.with_name(f"._{note.name}"), "\0\5\x16\7Mac OS X")
+    if not is_coco:
+        text(tmp_path / "labels/a.txt", ROW)
+    ((_, labels),) = read(tmp_path)
+    assert labels.class_names == ("bus",)
+
+
+def test_a_sensors_levels_are_shown_as_the_edge_shows_them(tmp_path: Path) -> None:
+    """A thermal set of sixteen bits was one tone of grey to the detector that it judged."""
+    levels = np.full((60, 80), 29_300, np.uint16)
+    levels[20:40, 30:50] = 30_500
+    cv2.imwrite(str(tmp_path / "a.tif"), levels)
+    image = read_image(tmp_path / "a.tif")
+    assert image is not None
+    assert np.ptp(image) > 150
+
+
 @pytest.mark.parametrize("encoding", ["iso-8859-1", "utf-16"])
 def test_an_xml_is_read_in_its_encoding_and_difficult_objects_do_not_count(
     tmp_path: Path, encoding: str

@@ -156,7 +156,7 @@ def open_clips(place: Path, options: Options) -> Mapping[str, Callable[[], Seque
     """
     if place.is_file():
         return {place.stem: partial(_open, place.stem, place, options)}
-    files = sorted(file for file in place.iterdir() if file.suffix.lower() in _ENDINGS and file.is_file())
+    files = sorted(one for one in place.glob("[!.]*") if one.suffix.lower() in _ENDINGS and one.is_file())
     if not files and (images := sequence_files(place)):
         return {place.name: partial(_open_images, place, images, options)}
     if not files:
