@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from hvt_archive.exports.video import pictures
 from hvt_common.errors import UserError
@@ -43,7 +44,7 @@ def write_coco(recorded: Recorded, folder: Path) -> None:
             "date_captured": utc_text(sample.capture_ns),
         }
         images.append(image)
-        boxes += _annotations(overlay, image["id"], numbers, first=len(boxes) + 1)
+        boxes += _annotations(overlay, image, numbers, first=len(boxes) + 1)
     content = {
         "info": {"description": f"hvt: edge {recorded.edge}, session {recorded.session}"},
         "images": images,
@@ -54,17 +55,19 @@ def write_coco(recorded: Recorded, folder: Path) -> None:
 
 
 def _annotations(
-    overlay: Overlay, image: int, numbers: dict[str, int], *, first: int
+    overlay: Overlay, image: dict[str, Any], numbers: dict[str, int], *, first: int
 ) -> list[dict[str, Any]]:
+    # Cut at the picture's edges: trainers leave out a picture with a box that is half a pixel outside.
+    boxes = np.clip(overlay.boxes_base_px, 0, (image["width"], image["height"]) * 2)
     found: list[dict[str, Any]] = []
     for row, track_id in enumerate(overlay.track_ids.tolist()):
-        if overlay.doubted[row]:
+        x1, y1, x2, y2 = boxes[row].tolist()
+        if overlay.doubted[row] or not (x1 < x2 and y1 < y2):
             continue
-        x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
         found.append(
             {
                 "id": first + len(found),
-                "image_id": image,
+                "image_id": image["id"],
                 "category_id": numbers.setdefault(overlay.classes[row], len(numbers) + 1),
                 "bbox": [x1, y1, x2 - x1, y2 - y1],
                 "area": (x2 - x1) * (y2 - y1),

@@ -52,6 +52,8 @@ class McapFile(SinkWriter[Event]):
         self.path: Path = path
         self._edge = edge
         self._run = DecodableRun()
+        self._still = -1
+        """The newest one: of several objects in it each has an event, and all together one picture."""
         fresh = has_nothing(path)
         with telling(f"MCAP file {path} cannot be created: "):
             self._file: BinaryIO = path.open("wb")
@@ -75,8 +77,8 @@ class McapFile(SinkWriter[Event]):
             case Overlay():
                 self._write("tracks", _annotations(item), item)
             case Refinement():
-                picture = still_picture(item)
-                if picture is not None:
+                if item.still_sequence != self._still and (picture := still_picture(item)) is not None:
+                    self._still = item.still_sequence
                     self._write("stills", CompressedImage(data=picture[0], format="jpeg"), item)
                 self._write("events", Log(level=Log.INFO, message=event_text(item)), item)
             case RecordedStill():
@@ -105,7 +107,10 @@ class McapFile(SinkWriter[Event]):
             frame_index, capture_ns = at.shown_at
         # Times come from the wire: one beyond the range of timestamps becomes the nearest that can be held.
         capture_ns = min(max(capture_ns, 0), _LATEST_NS)
-        message.timestamp.CopyFrom(Timestamp(seconds=capture_ns // SECOND_NS, nanos=capture_ns % SECOND_NS))
+        # Foxglove lays annotations over the picture of their own time, not of the whole message's.
+        parts = (*message.points, *message.texts) if isinstance(message, ImageAnnotations) else ()
+        for one in (message, *parts):
+            one.timestamp.CopyFrom(Timestamp(seconds=capture_ns // SECOND_NS, nanos=capture_ns % SECOND_NS))
         if isinstance(message, CompressedVideo | CompressedImage | LocationFix):
             message.frame_id = self._edge
         elif isinstance(message, Log):

@@ -39,6 +39,7 @@ from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.rrd import Recording, damaged, ends_its_reader, recorded, settings
 from programs.small_disk import small_disk
+from rigs import examples
 from rigs.messages import PLAIN
 
 FRAMES, SIZE, TRACKS = 60, (320, 192), 6
@@ -184,6 +185,15 @@ def test_the_data_set_opens_in_coco_tools(recording, events, tmp_path):
     assert len(coco.getAnnIds(imgIds=[30])) == TRACKS
 
 
+def test_boxes_of_a_data_set_lie_in_its_pictures(events, tmp_path):
+    """Boxes are recorded to half a pixel: trainers take the label for damaged, and leave the whole picture out."""
+    boxes = np.array([(-4, -0.5, 40, 40), (300, 180, 321, 193), (321, 0, 330, 9), (-9, 50, 0, 60)], np.float32)
+    flight = recorded(tmp_path / "flight.rrd", [events[0], examples.overlay(0, boxes, capture_ns=START_NS)])
+    out = export(flight, tmp_path / "set", "--to", "coco")
+    found = json.loads((out / "annotations.json").read_text())["annotations"]
+    assert [(one["track_id"], one["bbox"]) for one in found] == [(1, [0, 0, 40, 40]), (2, [300, 180, 20, 12])]
+
+
 def test_the_stills_come_with_what_the_base_showed(recording, events, tmp_path):
     """The pictures that one looks for would stay inside the recording."""
     sent = {one.still for one in events if isinstance(one, Refinement)}
@@ -238,6 +248,8 @@ def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
     facts = [{one.key: one.value for one in points.metadata} for points in boxes.points]
     assert sorted(int(one["id"]) for one in facts) == list(range(1, TRACKS + 1))
     assert all(text.text.split()[0] == one["id"] for text, one in zip(boxes.texts, facts, strict=True))
+    stamps = {one.timestamp.ToNanoseconds() for one in (boxes, *boxes.points, *boxes.texts)}
+    assert stamps == {found["/uav-1/tracks"][30][1].log_time}, "Foxglove lays each over the picture of its time"
 
 
 @pytest.mark.parametrize(

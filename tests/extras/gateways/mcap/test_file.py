@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
-from mcap.reader import NonSeekingReader
+from mcap.reader import NonSeekingReader, make_reader
 
 from hvt_common.errors import UserError
 from hvt_gateways.mcap.file import McapFile
 from hvt_ground.events import Notice
 from programs.small_disk import files_at_most
+from rigs import examples
 
 
 def test_a_ground_that_was_killed_leaves_all_but_the_last_moment(tmp_path: Path) -> None:
@@ -28,6 +32,19 @@ def test_a_ground_that_was_killed_leaves_all_but_the_last_moment(tmp_path: Path)
             pass
     assert 200 - found <= 32
     file.close()
+
+
+def test_a_still_of_several_objects_is_one_picture(tmp_path: Path) -> None:
+    """Half of the file were pictures that are in it already, and a count of the stills too large."""
+    path = tmp_path / "flight.mcap"
+    jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    file = McapFile(path, edge="uav-1")
+    for still, track in ((1, 5), (1, 6), (2, 5)):
+        file.log(examples.refinement(still_sequence=still, track_id=track, still=jpeg))
+    file.close()
+    with path.open("rb") as written:
+        topics = Counter(channel.topic for _, channel, _ in make_reader(written).iter_messages())
+    assert topics == {"/uav-1/stills": 2, "/uav-1/events": 3}
 
 
 def test_a_full_disk_is_a_sentence_and_leaves_no_empty_file(tmp_path: Path) -> None:
