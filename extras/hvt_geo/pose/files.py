@@ -50,9 +50,10 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
     "position_error_m": (0.001, 100_000),
     "height_error_m": (0.001, 100_000),
     "angle_error_deg": (0.001, 180),
-    "camera_pitch_deg": (-90, 90),
+    "camera_pitch_deg": (-92, 92),
     "pitch_deg": (-90, 90),
 }
+"""So far a gimbal's pitch goes where it means straight down or up."""
 _FAR = 1e6
 _ANY_TIME = (-1e11, 1e11)
 _LONGEST_PAUSE_S = 86_400.0
@@ -66,6 +67,8 @@ _NOWHERE = 0.001
 """Degrees around 0, 0: there a receiver without a fix says it is."""
 _UNKNOWN_YAW = (655.35, 65535.0)
 """MAVLink senders write these for an unknown yaw, in degrees and in hundredths."""
+_UNSAID = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
+"""How programs write that they have no value, in small letters."""
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+\s*", re.ASCII)
 _Values = Mapping[str, float]
 
@@ -134,7 +137,9 @@ def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
         raise wrong[0]
     if wrong:
         _log.warning("%d of %d rows are left out: %s", len(wrong), len(wrong) + len(good), wrong[0])
-    here = _of_one_time([row for _, row in good], path)
+    # Where some count from the clip's first frame, nobody knows when of it others with UTC alone are.
+    timed = [row for _, row in good if "time_s" in row] or [row for _, row in good]
+    here = _of_one_time(timed, path)
     begin_s = min((row["utc_s"] for row in here if "utc_s" in row), default=0.0)
     placed = [row for row in here if max(abs(row["latitude_deg"]), abs(row["longitude_deg"])) >= _NOWHERE]
     if len(placed) < len(here):
@@ -232,7 +237,7 @@ def _orientation(row: _Values, prefix: str) -> Orientation | None:
     yaw, pitch = row.get(f"{prefix}yaw_deg"), row.get(f"{prefix}pitch_deg")
     if yaw is None or pitch is None or yaw in _UNKNOWN_YAW:
         return None
-    return Orientation(compass_deg(yaw), pitch, row.get(f"{prefix}roll_deg", 0.0))
+    return Orientation(compass_deg(yaw), max(-90.0, min(90.0, pitch)), row.get(f"{prefix}roll_deg", 0.0))
 
 
 def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
@@ -240,9 +245,10 @@ def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     between = max(",;\t|", key=(written or [""])[0].count)
     lines = csv.DictReader(written, delimiter=between, skipinitialspace=between != "\t")
     names = [(name or "").strip().lower() for name in lines.fieldnames or ()]
+    lines.fieldnames = names
+    names = [name for name in names if name]  # row numbers and what follows a last comma have none
     if twice := [name for name in names if names.count(name) > 1]:
         raise UserError(f"pose file {path} has the column {twice[0]!r} twice")
-    lines.fieldnames = names
     unknown = [name for name in names if name not in COLUMNS]
     if unknown:
         raise UserError(f"pose file {path} has the column {unknown[0]!r}; known are {', '.join(COLUMNS)}")
@@ -261,7 +267,8 @@ def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
 
 
 def _table_row(line: Mapping[str, str | None], where: str) -> _Values:
-    said = {name: value.strip() for name, value in line.items() if value is not None and value.strip()}
+    stripped = {name: (value or "").strip() for name, value in line.items()}
+    said = {name: value for name, value in stripped.items() if value.lower() not in _UNSAID}
     utc = said.pop("utc", None)
     row = {name: _number(value, f"{where}: {name}") for name, value in said.items()}
     if utc is not None and "time_s" not in row:
@@ -307,7 +314,7 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
                 "longitude_deg": _number(point.get("lon", ""), f"{where}: lon"),
             }
             elevation = (point.findtext("{*}ele") or "").strip()
-            if elevation:
+            if elevation.lower() not in _UNSAID:
                 row["altitude_m"] = _number(elevation, f"{where}: ele")
         except UserError as error:
             yield error

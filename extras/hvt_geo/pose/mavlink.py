@@ -1,9 +1,9 @@
 """Poses from an autopilot by MAVLink: listens only, and sends it nothing.
 
-Place and height come from GLOBAL_POSITION_INT, the platform's angles from ATTITUDE or ATTITUDE_QUATERNION, the
-camera's from GIMBAL_DEVICE_ATTITUDE_STATUS, MOUNT_ORIENTATION or MOUNT_STATUS, its field of view from
-CAMERA_FOV_STATUS, the fix and its accuracy from GPS_RAW_INT. A value that is older than two seconds, a fix of ten, is
-not known any more.
+Place and height come from GLOBAL_POSITION_INT, the platform's angles from ATTITUDE or ATTITUDE_QUATERNION,
+the camera's from GIMBAL_DEVICE_ATTITUDE_STATUS, MOUNT_ORIENTATION or MOUNT_STATUS, its field of view from
+CAMERA_FOV_STATUS, the fix and its accuracy from the better of GPS_RAW_INT and GPS2_RAW. A value that is older
+than two seconds, a fix of ten, is not known any more.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _OF_AUTOPILOT = frozenset(
 _FIXES = ("GPS_RAW_INT", "GPS2_RAW")
 _AUTOPILOT = 1
 """``MAV_COMP_ID_AUTOPILOT1``."""
-_LEAST_FIX = 2
-"""``GPS_FIX_TYPE_2D_FIX``; with less an autopilot says where its estimate has drifted to from 0, 0."""
+_FIX_2D = 2
+"""``GPS_FIX_TYPE_2D_FIX``: no altitude. With less an autopilot says where its estimate has drifted to from 0, 0."""
 _NOWHERE = 10_000
 """1e-7 degrees around 0, 0: a hundred metres in the Gulf of Guinea."""
 _MOST_LATITUDE = 900_000_000
@@ -109,7 +109,7 @@ class MavlinkPose:
         hfov = self._hfov_deg
         if field is not None and 0 < field.hfov < 180:
             hfov = field.hfov
-        fix = known.get("GPS_RAW_INT")
+        fix = max(_fixes(known), key=lambda one: one.fix_type, default=None)
         accuracy = {
             name: value / 1000
             for name, value in (
@@ -125,7 +125,7 @@ class MavlinkPose:
             latitude_deg=place.lat / 1e7,
             longitude_deg=place.lon / 1e7,
             height_m=_clipped(place.relative_alt / 1000),
-            altitude_m=_clipped(place.alt / 1000),
+            altitude_m=None if fix and fix.fix_type == _FIX_2D else _clipped(place.alt / 1000),
             camera=camera,
             platform=platform,
             hfov_deg=hfov,
@@ -187,7 +187,7 @@ class MavlinkPose:
         with self._lock:
             if len(self._newest) > _MOST_KNOWN:
                 self._newest = {key: one for key, one in self._newest.items() if now_ns - one[0] <= _OLD_NS}
-            if name in _FIXES and message.fix_type >= _LEAST_FIX and _has_no_fix(self._of(whose, now_ns)):
+            if name in _FIXES and message.fix_type >= _FIX_2D and _has_no_fix(self._of(whose, now_ns)):
                 self._newest.pop((*whose, "GLOBAL_POSITION_INT"), None)  # its former place
             if len(self._newest) <= _MOST_KNOWN:
                 self._newest[(*whose, name)] = (now_ns, message)
@@ -228,9 +228,12 @@ def _has_place(known: dict[str, Any]) -> bool:
     return not _has_no_fix(known)
 
 
+def _fixes(known: dict[str, Any]) -> list[Any]:
+    return [known[name] for name in _FIXES if name in known]
+
+
 def _has_no_fix(known: dict[str, Any]) -> bool:
-    fixes = [known[name].fix_type for name in _FIXES if name in known]
-    return bool(fixes) and max(fixes) < _LEAST_FIX
+    return bool(fixes := _fixes(known)) and max(one.fix_type for one in fixes) < _FIX_2D
 
 
 def _attitude(known: dict[str, Any]) -> Orientation | None:

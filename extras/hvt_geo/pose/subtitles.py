@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 _FULL_FRAME_MM = 36.0
 """Width of the picture that 35 mm equivalent focal lengths are said for."""
-_OVERSHOT_DEG = 92.0
-"""So far a gimbal's pitch goes where it means straight down or up."""
 _NUMBER = r"[+-]?\d++(?:[.,]\d++)?+(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d)"
 """With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06'01"."""
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
@@ -87,9 +85,6 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
         row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
-    pitch = row.get("camera_pitch_deg", 0.0)
-    if 90 < abs(pitch) <= _OVERSHOT_DEG:
-        row["camera_pitch_deg"] = math.copysign(90.0, pitch)
     return row
 
 

@@ -170,7 +170,7 @@ def test_beyond_its_ends_and_in_a_gap_a_file_says_nothing(tmp_path):
         (
             "a.srt",
             MINI.replace("gb_pitch: -45.0", "gb_pitch: -95.0"),
-            "camera_pitch_deg is -95, accepted is -90",
+            "camera_pitch_deg is -95, accepted is -92",
         ),
     ],
 )
@@ -353,6 +353,7 @@ def test_a_track_is_read_as_a_phone_writes_it(tmp_path, caplog, seconds, says):
 def test_a_track_has_decimal_commas_in_its_heights(tmp_path):
     """The height would be a thousand times what it is, or the file be refused."""
     assert read(tmp_path, "a.gpx", track(range(4), elevation="68,000"))[1].altitude_m == 68.0
+    assert read(tmp_path, "a.gpx", track(range(4), elevation="NaN"))[1].altitude_m is None
 
 
 @pytest.mark.parametrize(
@@ -363,10 +364,14 @@ def test_a_track_has_decimal_commas_in_its_heights(tmp_path):
         "time_s\tlatitude_deg\tlongitude_deg\theight_m\n0\t47.5\t9.7\t50.5\n",
         'time_s,latitude_deg,longitude_deg,height_m\n"0,0","47,5","9,7","50,5"\n',
         "\ufeffheight_m, longitude_deg, latitude_deg, time_s\r\n50.5, 9.7, 47.5, 0\r\n",
+        ",time_s,latitude_deg,longitude_deg,height_m,\n0,0,47.5,9.7,50.5,\n1,1,47.5,9.7,50.5,\n",
+        f"{PLACE},height_m,hfov_deg\n0,47.5,9.7,50.5,NaN\n1,47.5,9.7,50.5,N/A\n2,nan,null,-,None\n3,,,,\n",
+        f"{PLACE},height_m,camera_yaw_deg,camera_pitch_deg\n0,47.5,9.7,50.5,0,-90.3\n",
+        f"utc,{PLACE},height_m\n2026-01-01T10:00:00Z,,49,9.7,8\n2026-01-01T10:00:01Z,0,47.5,9.7,50.5\n",
     ],
 )
 def test_a_table_is_read_as_a_spreadsheet_writes_it(tmp_path, text):
-    """Half of Europe would have to convert each table by hand."""
+    """Half of Europe would have to convert each table by hand, and who has pandas, a gimbal or a gap as well."""
     _, pose = read(tmp_path, "a.csv", text)
     assert (pose.latitude_deg, pose.longitude_deg, pose.height_m) == pytest.approx((47.5, 9.7, 50.5))
 

@@ -51,6 +51,23 @@ def test_place_and_attitude_come_from_the_autopilot(source, send, autopilot, wai
 
 
 @pytest.mark.parametrize(
+    ("fixes", "altitude_m", "error_m"),
+    [(((3, 700),), 550.0, 0.7), (((2, 9000),), None, 9.0), (((0, 900_000), (4, 500)), 550.0, 0.5)],
+)
+def test_the_best_receiver_says_how_sure_the_place_is(
+    source, send, autopilot, wait_for, fixes, altitude_m, error_m
+):
+    """One without a fix made places of the other unsure by a kilometre; of two dimensions the altitude is unknown."""
+    one = autopilot()
+    for (kind, error), name in zip(fixes, ("gps_raw_int", "gps2_raw"), strict=False):
+        between = (0,) if name == "gps_raw_int" else (0, 0, 0, 0)
+        send(one.say(name, 0, kind, 0, 0, 0, *([65535] * 4), 9, *between, error, error))
+    send(one.place())
+    pose = wait_for(source)
+    assert (pose.altitude_m, pose.height_m, pose.position_error_m) == (altitude_m, 120.0, error_m)
+
+
+@pytest.mark.parametrize(
     ("flags", "yaw"),
     [
         (64, 90.0),  # yaw in the earth's frame
