@@ -187,7 +187,9 @@ def test_the_data_set_opens_in_coco_tools(recording, events, tmp_path):
 
 def test_boxes_of_a_data_set_lie_in_its_pictures(events, tmp_path):
     """Boxes are recorded to half a pixel: trainers take the label for damaged, and leave the whole picture out."""
-    boxes = np.array([(-4, -0.5, 40, 40), (300, 180, 321, 193), (321, 0, 330, 9), (-9, 50, 0, 60)], np.float32)
+    boxes = np.array(
+        [(-4, -0.5, 40, 40), (300, 180, 321, 193), (321, 0, 330, 9), (-9, 50, 0, 60)], np.float32
+    )
     flight = recorded(tmp_path / "flight.rrd", [events[0], examples.overlay(0, boxes, capture_ns=START_NS)])
     out = export(flight, tmp_path / "set", "--to", "coco")
     found = json.loads((out / "annotations.json").read_text())["annotations"]
@@ -249,7 +251,9 @@ def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
     assert sorted(int(one["id"]) for one in facts) == list(range(1, TRACKS + 1))
     assert all(text.text.split()[0] == one["id"] for text, one in zip(boxes.texts, facts, strict=True))
     stamps = {one.timestamp.ToNanoseconds() for one in (boxes, *boxes.points, *boxes.texts)}
-    assert stamps == {found["/uav-1/tracks"][30][1].log_time}, "Foxglove lays each over the picture of its time"
+    assert stamps == {found["/uav-1/tracks"][30][1].log_time}, (
+        "Foxglove lays each over the picture of its time"
+    )
 
 
 @pytest.mark.parametrize(
