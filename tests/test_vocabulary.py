@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # What no text of the project says any more, code, comments, documents and tables alike.
 _NEVER = re.compile(
-    r"\b(asked_cut|beliefs?|cadences?|every_n|eyes|fates?|few_heaps|give_way|haves|hearsay|journals?|knees?|lends?|lent|"
+    r"\b(asked_cut|beliefs?|cadences?|every_n|eyes|fates?|few_heaps|give_way|haves|hearsay|journals?|knees?|lends?|lent|levers?|"
     r"lendable|lived_time|numbers_seen|own_ns|pulses?|pulsed|purses?|report_back|rivals?|same_id|sights?|still_numbers|"
     r"swallow(s|ed|ing)?|ticks?|unchanging|whereabouts|wish(es|ed)?|workshops?)\b",
     re.IGNORECASE,

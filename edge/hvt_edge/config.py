@@ -348,7 +348,7 @@ class EdgeConfig:
 
     @property
     def measures(self) -> bool:
-        """Whether tracks and stills are sent only while they are measured to pay (`hvt_edge.perception.levers`)."""
+        """Whether tracks and stills are sent only while they are measured to pay (`hvt_edge.perception.auto`)."""
         return self.profile == "auto"
 
     @property

@@ -2,7 +2,7 @@
 
 Settings are frozen; values that commands, the link and measurements change live here. Three modules write:
 `hvt_edge.control` the ground's commands, the frame loop (`hvt_edge.video.reconfigure`) the link's rate and the
-settings of the open x265, and `hvt_edge.perception.levers` which parts are worth sending beside the video.
+settings of the open x265, and `hvt_edge.perception.auto` which parts are worth sending beside the video.
 The encoder, the budget, ``info``, status and summary all read the same.
 
 A keyframe comes at the start, on a long schedule, and on request of grounds, of the link, of the store: any thread
@@ -35,7 +35,7 @@ objects (0.8) at 200 kbps."""
 
 
 @dataclass(frozen=True, slots=True)
-class Levers:
+class AutoDecisions:
     """Which parts are sent beside the video, as far as the settings allow it."""
 
     tracks: bool = True
@@ -77,7 +77,7 @@ class OperatingPoint:
     preset: str = ""
     preset_says: str = ""
     """The reason for the preset, in a line for the user; empty where nothing had to be given up."""
-    levers: Levers = Levers()
+    decisions: AutoDecisions = AutoDecisions()
     started_ns: int = 0
     """When the first frame was taken; 0 before."""
 
@@ -118,9 +118,9 @@ class Operating:
         """Use this preset from the next keyframe on; ``says`` is the sentence about it."""
         self._set(preset=preset, preset_says=says)
 
-    def pull(self, levers: Levers) -> None:
+    def decide(self, decisions: AutoDecisions) -> None:
         """Set which parts are sent beside the video, as decided by the measurements."""
-        self._set(levers=levers)
+        self._set(decisions=decisions)
 
     def _set(self, **changes: object) -> None:
         with self._lock:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.edge_words import counts_text, lever_sentences, part_words, still_words
+from hvt_common.protocol.edge_words import counts_text, decision_sentences, part_words, still_words
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import FailedPart
 from hvt_common.units import SECOND_NS, bitrate_text
@@ -256,7 +256,7 @@ def _why(session: SessionState) -> list[str]:
         why.append(f"Not sent as stills: {counts_text(session.stills_not_sent)}.")
     if session.still_outcomes:
         why.append(f"Of the objects in stills: {counts_text(session.still_outcomes)}.")
-    return why + lever_sentences(session.levers)
+    return why + decision_sentences(session.decisions)
 
 
 def _failure(name: str, part: FailedPart, at_ns: int) -> str:

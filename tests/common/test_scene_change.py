@@ -83,7 +83,7 @@ def test_a_scene_of_little_contrast_is_one_scene(name):
 
 @pytest.mark.parametrize(("before", "after"), CUTS)
 def test_a_cut_is_seen_in_each(before, after):
-    """What was measured of the scene before would hold levers for seconds."""
+    """What was measured of the scene before would hold decisions for seconds."""
     assert 6 in changes(scene(before)[:6] + scene(after)[:6])
 
 

@@ -28,7 +28,7 @@ def summary_of(
     """Of a short flight."""
     now = SimpleNamespace(
         method="M6",
-        levers=SimpleNamespace(
+        decisions=SimpleNamespace(
             says="no tracks: the video hides 0 objects; stills: they name 2 of 3 otherwise"
         ),
         preset="superfast",

@@ -130,7 +130,7 @@ def test_what_auto_decides_is_the_same_and_stands_in_the_recording(tmp_path: Pat
     said = [[text for _, _, text in run.recording.events() if "tracks: " in text] for run in runs]
     assert said[0] == said[1]
     assert said[0][0].split(": ")[0] in ("The edge sends its tracks", "The edge sends no tracks")
-    hidden = [int(re.search(r"(\d+) object", run.edge["levers"])[1]) for run in runs]
-    assert "the ground misses" in blind.edge["levers"]
+    hidden = [int(re.search(r"(\d+) object", run.edge["decisions"])[1]) for run in runs]
+    assert "the ground misses" in blind.edge["decisions"]
     assert hidden[2] > 3 * hidden[0] > 0
     assert blind.ground["tracks"] > 0

@@ -92,7 +92,7 @@ def part_words(part: str) -> str:
     return PART_WORDS.get(part, part)
 
 
-LEVER_WORDS: Mapping[str, str] = MappingProxyType(
+DECISION_WORDS: Mapping[str, str] = MappingProxyType(
     {
         "tracks": "The edge sends its tracks",
         "no tracks": "The edge sends no tracks",
@@ -105,17 +105,17 @@ LEVER_WORDS: Mapping[str, str] = MappingProxyType(
 """Decision of ``--profile auto`` → how a sentence on it begins."""
 
 
-def lever_decisions(says: str) -> list[tuple[str, str]]:
-    """Each decision of `Status.levers`, and why: ``tracks: A; stills paused: B``."""
+def each_decision(says: str) -> list[tuple[str, str]]:
+    """Each decision of `Status.decisions`, and why: ``tracks: A; stills paused: B``."""
     parts = [re.split("[:,] ", part, maxsplit=1) for part in says.split("; ") if part]
     return [(part[0], part[1] if len(part) > 1 else "") for part in parts]
 
 
-def lever_sentences(says: str) -> list[str]:
+def decision_sentences(says: str) -> list[str]:
     """The same as sentences for people; a decision of a later version is shown by its own word."""
     sentences = []
-    for decision, why in lever_decisions(says):
-        begins = LEVER_WORDS.get(decision, f"{decision[:1].upper()}{decision[1:]}")
+    for decision, why in each_decision(says):
+        begins = DECISION_WORDS.get(decision, f"{decision[:1].upper()}{decision[1:]}")
         sentence = f"{begins}: {why}." if why else f"{begins}."
         if why == "no answer yet":  # none may have been sent
             sentence = f"{begins.replace('are sent', 'may be sent')}: the ground has judged none yet."

@@ -37,8 +37,8 @@ from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE, Recall
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.perception.analyzer import AnalyzedFrame
+from hvt_edge.perception.auto import Measured
 from hvt_edge.perception.cpu_budget import CpuBudget
-from hvt_edge.perception.levers import Measured
 
 _MOST_OPEN = 32
 """Comparisons that wait for a report: half a minute of them."""

@@ -27,7 +27,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.loop.counts import Cores, FrameCounts
-from hvt_edge.operating import Levers, LoopClock, Operating
+from hvt_edge.operating import AutoDecisions, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
 _LEAST_OLD_S = 1.5
@@ -169,7 +169,7 @@ class EdgeState:
     lockstep: bool
     duration_s: float
     method: str
-    levers: Levers
+    decisions: AutoDecisions
     """The parts sent beside the video, and the reason."""
     operating: OperatingState
     total_bps: float | None
@@ -315,7 +315,7 @@ class Heartbeat:
             lockstep=lockstep,
             duration_s=counts.duration_s(config.nominal_fps),
             method=now.method,
-            levers=now.levers,
+            decisions=now.decisions,
             operating=OperatingState(
                 source_size=self.view.source_size,
                 base_size=self.view.base_size,

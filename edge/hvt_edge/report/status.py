@@ -23,13 +23,13 @@ from hvt_common.protocol.messages import (
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
-from hvt_edge.operating import Levers, Operating
+from hvt_edge.operating import AutoDecisions, Operating
 from hvt_edge.report.state import EdgeState, Heartbeat, LinkState
 
-_PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
+_PART_BYTES, _REASON_BYTES, _DECISIONS_BYTES = 24, 160, 120
 _MOST_MS, _MOST_AGE_MS, _MOST_CORES = 60_000.0, 2**32 - 1, 4096.0
 """The largest numbers that a report can hold."""
-_LEVERS_REST = 10
+_DECISIONS_REST = 10
 _REPORTED: tuple[StillOutcome, ...] = ("sent", "deferred", "dropped")
 _LATE_NS = 2 * SECOND_NS
 """A report that has waited this long for room beside video goes before the next frame: grounds need it too."""
@@ -89,14 +89,14 @@ class StatusReporter:
         """The report of the newest second, not sent yet."""
         self._due_ns: int | None = None
         """The time since which a report waits."""
-        self._reported: Levers | None = None
+        self._reported: AutoDecisions | None = None
         self._reported_sequence = 0
 
     def send(self, phase: Literal["running", "ended"]) -> None:
         """Make the report of this second, and send it as soon as it leaves video its room; the last one waits."""
         state = self._of.beat(phase)
         # Made once: the transmitter packs a report twice, first for its size.
-        self._pending = (state, self._levers_text(state.levers))
+        self._pending = (state, self._decisions_text(state.decisions))
         self._due_ns = self._of.loop_clock() if self._due_ns is None else self._due_ns
         self.send_pending(last=phase == "ended")
 
@@ -104,11 +104,11 @@ class StatusReporter:
         """Called before each frame: a report that found no room is tried again."""
         if self._pending is None:
             return
-        (state, levers), now_ns = self._pending, self._of.loop_clock()
+        (state, decisions), now_ns = self._pending, self._of.loop_clock()
         late = self._due_ns is not None and now_ns - self._due_ns >= _LATE_NS
         if self._of.transmitter.metadata(
             Channel.STATUS,
-            lambda at_ns: self._status(state, levers, at_ns).pack(),
+            lambda at_ns: self._status(state, decisions, at_ns).pack(),
             now_ns=now_ns,
             before_frames=late,
             last=last,
@@ -116,16 +116,16 @@ class StatusReporter:
             self._pending = self._due_ns = None
             self._sequence += 1
 
-    def _levers_text(self, levers: Levers) -> str:
-        # Sent after a change of a lever, and now and then: on a thin link a sentence a second is not free.
+    def _decisions_text(self, decisions: AutoDecisions) -> str:
+        # Sent after a change of a decision, and now and then: on a thin link a sentence a second is not free.
         sent = self._reported
-        moved = sent is None or (levers.tracks, levers.stills) != (sent.tracks, sent.stills)
-        if not levers.says or (not moved and self._sequence - self._reported_sequence < _LEVERS_REST):
+        moved = sent is None or (decisions.tracks, decisions.stills) != (sent.tracks, sent.stills)
+        if not decisions.says or (not moved and self._sequence - self._reported_sequence < _DECISIONS_REST):
             return ""
-        self._reported, self._reported_sequence = levers, self._sequence
-        return fitted_text(levers.says, _LEVERS_BYTES)
+        self._reported, self._reported_sequence = decisions, self._sequence
+        return fitted_text(decisions.says, _DECISIONS_BYTES)
 
-    def _status(self, state: EdgeState, levers: str, at_ns: int) -> Status:
+    def _status(self, state: EdgeState, decisions: str, at_ns: int) -> Status:
         # In lockstep no field depends on this machine's speed: the same input gives the same bytes.
         account = self._of.ledger.summary(state.duration_s)
         worst, frames, transmitter = account.worst_window_bps, state.frames, self._of.transmitter
@@ -173,7 +173,7 @@ class StatusReporter:
                 )
                 for one in self._of.failures.parts[:MOST_FAILED_PARTS]
             ),
-            levers=levers,
+            decisions=decisions,
             frames=frames.account.as_counts(),
             coded_fps=frames.account.coded_fps,
             auto_fps=frames.account.auto_fps,
@@ -194,8 +194,8 @@ def status_text(state: EdgeState, *, paused_s: float = 0.0) -> str:
     ]
     if backlog is not None and (backlog.stills or backlog.segments):
         parts.append(f"kept {backlog.stills} stills, {backlog.video_s:.0f} s")
-    if state.levers.says:
-        parts.append(state.levers.says)
+    if state.decisions.says:
+        parts.append(state.decisions.says)
     if state.detection_slow:
         parts.append(f"boxes {state.boxes_age_s:.1f} s behind: detection is too slow")
     if paused_s:
@@ -231,7 +231,7 @@ def summary(of: Heartbeat, *, unreached: str) -> dict[str, Any]:
         "edge": config.edge_id,
         "session": f"{of.session_id:08x}",
         "method": now.method,
-        "levers": now.levers.says,
+        "decisions": now.decisions.says,
         "preset": now.preset,
         "preset_says": now.preset_says,
         "clip_paused_s": round(counts.paused_ns / SECOND_NS, 2),
@@ -286,7 +286,9 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         (
             "method",
-            f"auto, {content['method']}: {content['levers']}" if content["levers"] else content["method"],
+            f"auto, {content['method']}: {content['decisions']}"
+            if content["decisions"]
+            else content["method"],
         ),
         ("frames", f"{content['frame_account']['text']}; {content['duration_s']:.1f} s"),
         *([("", content["preset_says"])] if content["preset_says"] else []),

@@ -13,22 +13,22 @@ from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.link.stills import Still
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating import Keyframes, Levers
+from hvt_edge.operating import AutoDecisions, Keyframes
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
-from hvt_edge.perception.levers import LeverControl
+from hvt_edge.perception.auto import AutoControl
 from hvt_edge.perception.shadow import Detected, ShadowGround
 from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
 from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxStill
 from hvt_edge.stills.scheduler import Chooser, Coded
 
-_ALL = Levers()
+_ALL = AutoDecisions()
 
 
 @dataclass(eq=False)
 class StillStage:
     """Takes each frame with its access unit, if it has one, after the unit was sent.
 
-    With a ``reporter`` the edge's own tracks are sent at each decision step, before its stills. With ``levers``
+    With a ``reporter`` the edge's own tracks are sent at each decision step, before its stills. With ``auto``
     both depend on their measured gain.
     """
 
@@ -41,7 +41,7 @@ class StillStage:
     shadow: ShadowGround | None = None
     tracks_used: bool = True
     """Whether encoder or receivers use tracks; else only a method that sends stills, or a ground's request, does."""
-    levers: LeverControl | None = None
+    auto: AutoControl | None = None
     """Decides by reports of ``shadow`` and the grounds; None: tracks and stills are sent as the settings allow."""
 
     def __post_init__(self) -> None:
@@ -49,7 +49,7 @@ class StillStage:
         self.latest_tracks: Tracks | None = None
         """The tracks of the frame that `step` took last. In lockstep they change at the same point of the frame loop
         in every run, whatever `analyze` does meanwhile."""
-        self._levers = _ALL
+        self._decisions = _ALL
         self._scene_began = -1
         self._detected: Detected | None = None
         """Reported since the decision before; in lockstep a frame may be compared at this very moment."""
@@ -86,8 +86,8 @@ class StillStage:
         self.latest_tracks = analyzed.tracks
         self.chooser.on_demand.add(analyzed)
         with self.analyzer.cpu_budget.spending("choose") if analyzed.detected else nullcontext():
-            self._levers = self._decided(now_ns)
-            if self.reporter is not None and analyzed.detected and self._levers.tracks:
+            self._decisions = self._decided(now_ns)
+            if self.reporter is not None and analyzed.detected and self._decisions.tracks:
                 self.reporter.report(analyzed, now_ns=now_ns)
             return self.send(analyzed, now_ns=now_ns, held=held)
 
@@ -102,7 +102,7 @@ class StillStage:
         # A method's request waits until the link is free, which right behind a base frame it never is.
         allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
         self.chooser.consider(
-            analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not self._levers.stills
+            analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not self._decisions.stills
         )
         return self.send_pending(now_ns=now_ns, held=held)
 
@@ -159,35 +159,35 @@ class StillStage:
         """Note the cores that the process uses; about once a second."""
         cpu_budget = self.analyzer.cpu_budget
         cpu_budget.measure(cores, now_ns=now_ns)
-        if self.levers is not None:
-            self.levers.take_load(too_slow=cpu_budget.too_slow, now_ns=now_ns)
+        if self.auto is not None:
+            self.auto.take_load(too_slow=cpu_budget.too_slow, now_ns=now_ns)
 
-    def _decided(self, now_ns: int) -> Levers:
-        if self.levers is None:
+    def _decided(self, now_ns: int) -> AutoDecisions:
+        if self.auto is None:
             return _ALL
         if self.shadow is not None:
             if self.shadow.scene_began != self._scene_began:
                 self._scene_began = self.shadow.scene_began
-                self.levers.forget()
+                self.auto.forget()
             if self._detected is not None:
                 self.shadow.take_detected(self._detected)
                 self._detected = None
-            self.levers.measured = self.shadow.measured
-        self.levers.unlike = self.analyzer.view_unlike
-        levers = self.levers.decide(now_ns)
+            self.auto.measured = self.shadow.measured
+        self.auto.unlike = self.analyzer.view_unlike
+        decisions = self.auto.decide(now_ns)
         if self.shadow is not None:
-            self.shadow.stable = self.levers.stable
-        return levers
+            self.shadow.stable = self.auto.stable
+        return decisions
 
     def _note_change(self, result: StillResult) -> None:
         # A still has changed something if by it alone the ground names another object than the edge.
         tracks = self.latest_tracks
-        if self.levers is None or tracks is None:
+        if self.auto is None or tracks is None:
             return
         rows = (tracks.ids == result.track_id).nonzero()[0]
         if len(rows):
             name = self.chooser.class_names[int(tracks.class_ids[rows[0]])]
-            self.levers.take_answer(changed=not same_kind(result.class_name, name))
+            self.auto.take_answer(changed=not same_kind(result.class_name, name))
 
 
 @dataclass(eq=False)

@@ -216,7 +216,7 @@ class EncoderReconfiguration:
 
     @property
     def _metadata_bps(self) -> int:
-        return self.metadata_bps if self.operating.now.levers.tracks else 0
+        return self.metadata_bps if self.operating.now.decisions.tracks else 0
 
     @property
     def _moving(self) -> bool:
@@ -231,7 +231,7 @@ class EncoderReconfiguration:
 
     def _tell_split(self, decimation: int) -> None:
         assert self.split is not None
-        stills = self.operating.now.levers.stills
+        stills = self.operating.now.decisions.stills
         self.split.set_beside(metadata_bps=self._metadata_bps, stills=stills, sparse=decimation > 1)
 
     def _proposed_bps(self, decimation: int, *, changed: bool) -> int:

@@ -11,7 +11,7 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.perception.levers import LeverSettings
+from hvt_edge.perception.auto import AutoSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder import least_base_bps
 from hvt_edge.video.encoders.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
@@ -82,8 +82,8 @@ def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float)
     return split
 
 
-def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
-    return LeverSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
+def auto_settings(config: EdgeConfig, view: View) -> AutoSettings:
+    return AutoSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
 
 
 def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int, int]) -> Pacer | None:

@@ -30,10 +30,10 @@ from hvt_edge.loop.counts import FrameCounts, processors
 from hvt_edge.loop.pose import PoseSource, PoseStage
 from hvt_edge.loop.realtime import LinkControl
 from hvt_edge.operating import LoopClock, Operating, Rates, base_rate_bps
+from hvt_edge.perception.auto import AutoControl
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.perception.frame_ring import FrameRing
-from hvt_edge.perception.levers import LeverControl
 from hvt_edge.report.state import Heartbeat
 from hvt_edge.report.status import InfoReporter, StatusReporter
 from hvt_edge.source.contract import Source
@@ -48,8 +48,8 @@ from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.stage import BaseStage, LocalCopy
 from hvt_edge.video.x265 import TrackRegions
 from hvt_edge.wiring.link import (
+    auto_settings,
     channels_of,
-    lever_settings,
     make_budget,
     make_camera_rates,
     make_least_link,
@@ -210,9 +210,9 @@ class Stills:
             flight.stack.callback(self.backlog.close)
         sender = StillSender(outbox, maker=maker, transmitter=link.transmitter, backlog=self.backlog)
         flight.stack.callback(lambda: sender.close(clock()))
-        levers = trust = reporter = None
+        auto = trust = reporter = None
         if config.measures:
-            levers = LeverControl(link.operating, lever_settings(config, view))
+            auto = AutoControl(link.operating, auto_settings(config, view))
             trust = ViewTrust(trust_from(config.detector), hence="auto gives its tracks no credit")
         if config.send_tracks:
             reporter = TrackReporter(link.transmitter, session_id=flight.session_id)
@@ -229,7 +229,7 @@ class Stills:
             shadow=make_shadow(
                 config, flight.detector, before=flight.beginning.shadow, cpu_budget=cpu_budget
             ),
-            levers=levers,
+            auto=auto,
         )
 
 

@@ -21,7 +21,7 @@ from hvt_edge.stills.policy.registry import method
 from hvt_edge.video.encoder import X265, least_base_bps
 from hvt_edge.video.rate_model import PresetChoice, choose_preset, share_of
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
+from hvt_edge.wiring.link import SPARSE_SHARE, auto_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, scene
 
@@ -115,5 +115,5 @@ def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEA
         return config.share
     share = min(config.share, SPARSE_SHARE) if decimation > 1 else config.share
     seen = replace(seen, suppressed=0.0, suppressed_p=0.0)
-    pay = lever_settings(config, view).tracks_pay(seen.measured, total_bps=config.budget_bps)
+    pay = auto_settings(config, view).tracks_pay(seen.measured, total_bps=config.budget_bps)
     return FIRST_SHARE if pay and not method(config.method).video_only else share

@@ -48,7 +48,7 @@ def _sends(state: dict[str, Any]) -> str:
     operating = state["operating"]
     width, height = operating["base_size"]
     video = f"{width}x{height} at {operating['fps']:g} fps"
-    return _listed(state["method"], video, operating["preset_says"], state["levers"]["says"])
+    return _listed(state["method"], video, operating["preset_says"], state["decisions"]["says"])
 
 
 def _bits(state: dict[str, Any]) -> str:

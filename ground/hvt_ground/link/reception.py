@@ -14,7 +14,7 @@ from typing import Any
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.clock_offset import CaptureClock, ClockOffset
-from hvt_common.protocol.edge_words import lever_decisions, lever_sentences
+from hvt_common.protocol.edge_words import decision_sentences, each_decision
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
     MAX_MISSING_STILLS,
@@ -101,7 +101,7 @@ class Reception:
         self.newest_capture_ns = 0
         """Its capture time, the edge's clock; 0 before the first."""
         self.last_status: Status | None = None
-        self.levers = ""
+        self.decisions = ""
         """The edge's newest word on what ``auto`` sends beside the video, with the reasons."""
         self.edge_failing: Mapping[str, int] = {}
         """Since when each part of the edge fails, by its clock: a report has the newest try."""
@@ -216,10 +216,10 @@ class Reception:
         failing, since = (one for one in status.failed if not one.working), self.edge_failing
         self.edge_failing = {one.part: since.get(one.part, one.failed_ns) for one in failing}
         self.last_status = status
-        before, now = ([one for one, _ in lever_decisions(says)] for says in (self.levers, status.levers))
-        self.levers = status.levers or self.levers
-        if status.levers and now != before:  # numbers alone change each second: they are in the state
-            self._note("info", " ".join(lever_sentences(status.levers)))
+        before, now = ([one for one, _ in each_decision(says)] for says in (self.decisions, status.decisions))
+        self.decisions = status.decisions or self.decisions
+        if status.decisions and now != before:  # numbers alone change each second: they are in the state
+            self._note("info", " ".join(decision_sentences(status.decisions)))
         return True
 
     def backlog(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:

@@ -117,7 +117,7 @@ class SessionState:
     software: str = _of(lambda at: at.session.info.software)
     """The edge's."""
     method: str = _of(lambda at: at.session.reception.method)
-    levers: str = _of(lambda at: at.session.reception.levers)
+    decisions: str = _of(lambda at: at.session.reception.decisions)
     """The choices of ``--profile auto`` beside the video, with the reasons; empty without."""
     lockstep: bool = _of(lambda at: at.session.lockstep)
     duration_s: float = _of(lambda at: at.session.reception.duration_s)

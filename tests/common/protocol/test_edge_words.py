@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import get_args
 
 from hvt_common.protocol.edge_words import (
+    DECISION_WORDS,
     FRAME_GROUPS,
-    LEVER_WORDS,
     PART_WORDS,
     STILL_WORDS,
     FrameGroup,
     counts_text,
-    lever_sentences,
+    decision_sentences,
 )
 from hvt_ground.perception.stills.match import Outcome
 
@@ -74,18 +74,18 @@ def test_each_part_of_an_edge_that_may_fail_has_a_name_for_people():
 
 def test_what_auto_decides_is_said_in_sentences():
     """``tracks: …; stills show details, …`` means nothing to who flies; a later edge's decision is said as it is."""
-    assert lever_sentences(
+    assert decision_sentences(
         "no tracks: not measured yet; stills show details, they name 1 of 2 otherwise"
     ) == [
         "The edge sends no tracks: not measured yet.",
         "Stills are sent for their details: they name 1 of 2 otherwise.",
     ]
-    assert lever_sentences("video alone: this machine is too slow for the detector")[0].startswith(
+    assert decision_sentences("video alone: this machine is too slow for the detector")[0].startswith(
         "Video alone"
     )
-    assert lever_sentences("maps: of snow; all is well") == ["Maps: of snow.", "All is well."]
-    assert lever_sentences("") == []
-    assert all(words[0].isupper() for words in LEVER_WORDS.values())
+    assert decision_sentences("maps: of snow; all is well") == ["Maps: of snow.", "All is well."]
+    assert decision_sentences("") == []
+    assert all(words[0].isupper() for words in DECISION_WORDS.values())
 
 
 def test_the_page_has_all_words_of_a_summary():

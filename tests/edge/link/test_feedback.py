@@ -120,7 +120,7 @@ def detected(count: int, *, frame: int) -> Feedback:
 
 
 def test_what_the_ground_detects_is_taken_once_and_in_lockstep_by_its_frame():
-    """The levers would move at another frame in each run, or by what was said long ago."""
+    """The decisions would move at another frame in each run, or by what was said long ago."""
     inbox = FeedbackInbox()
     assert inbox.take_detected() is None
     for frame in range(

@@ -123,7 +123,7 @@ def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
     """A report with so many reasons."""
     counts = {f"{name}{number}": 4_000_000_000 for number in range(reasons)}
     known = replace(STATUS, session_id=2**32 - 1, send_ns=at_ns, media_ns=max(0, at_ns - NOW_NS))
-    return replace(known, sent=counts, deferred=counts, dropped=counts, failed=(), levers="")
+    return replace(known, sent=counts, deferred=counts, dropped=counts, failed=(), decisions="")
 
 
 def send_units(rig, *keyframes: int, until: int, size: int = 1_000) -> int:

@@ -57,7 +57,7 @@ def compared(*answers: Detections, confidences: dict[int, float], every: int = 3
 
 
 def test_the_gain_is_that_of_the_formula():
-    """Levers would be moved by a number that means something else than the docs say."""
+    """Decisions would be moved by a number that means something else than the docs say."""
     shadow = compared(found(0, 9), confidences={0: 0.9, 1: 0.5, **dict.fromkeys(range(2, 6), 0.7)})
     # Of the two that the base surely shows the source shows one: its silence about the other says nothing yet.
     true = 0.9 + 0.5 + 4 * 0.7 + 0.8
@@ -102,7 +102,7 @@ def test_two_that_are_hidden_tell_less_than_twenty():
 
 
 def test_what_was_measured_before_the_flight_counts():
-    """Else the first comparison in flight alone would move the levers."""
+    """Else the first comparison in flight alone would move the decisions."""
     before = compared(found(0), found(0), confidences={0: 0.9, 1: 0.9}).now
     assert before.hidden == 1
     shadow = ShadowGround(lambda _image: found(0, 1), confidence=CONFIDENCE, before=before)
@@ -260,7 +260,7 @@ def test_a_weak_detection_shows_what_a_strong_one_has_shown():
 
 
 def test_another_scene_forgets():
-    """Levers would be held for seconds by what a scene before the cut needed."""
+    """Decisions would be held for seconds by what a scene before the cut needed."""
     shadow = compared(found(), found(), found(), confidences={0: 0.9})
     assert shadow.now.comparisons > 1
     shadow.stable = True
@@ -282,7 +282,7 @@ def test_while_nothing_would_follow_it_looks_half_as_often():
 
 
 def test_a_thin_base_hides_what_a_rich_one_shows():
-    """On real x265, the real detector and the drawn scene: else the levers would follow noise."""
+    """On real x265, the real detector and the drawn scene: else the decisions would follow noise."""
     detector = open_detector(EMBEDDED_DETECTOR, threads=2, confidence=0.1)
     with DemoSource("demo", SourceSettings(size=(320, 180), fps=FPS, max_frames=12), seed=0) as source:
         frames = list(source.frames(start_ns=0))

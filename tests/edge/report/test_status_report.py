@@ -43,7 +43,7 @@ def test_numbers_that_a_report_cannot_say_end_no_flight():
         state="running",
         duration_s=60.0 * DAY_S,
         lockstep=False,
-        levers=SimpleNamespace(tracks=True, stills=True, says=""),
+        decisions=SimpleNamespace(tracks=True, stills=True, says=""),
         link=SimpleNamespace(reported_s=50.0 * DAY_S),
         frames=SimpleNamespace(
             account=FrameAccount.of_counts((), coded_fps=0.0, auto_fps=False), encoded=1, unanalyzed=0

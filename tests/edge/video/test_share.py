@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.operating import FIRST_SHARE, Levers, Operating, Rates
+from hvt_edge.operating import FIRST_SHARE, AutoDecisions, Operating, Rates
 from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.video.reconfigure import EncoderReconfiguration, Split
@@ -197,7 +197,7 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
         budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
         split=split(300_000, most_sparse_share=0.9),
     )
-    operating.pull(Levers(stills=False))
+    operating.decide(AutoDecisions(stills=False))
     reconfiguration.split.observe([], moment(0))
     for decimation, share in ((2, 0.9), (1, 1.0)):
         reconfiguration(decimation, SECOND)
@@ -219,5 +219,5 @@ def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     for number in range(60):
         reconfiguration.split.observe(crowd, moment(number / 3, from_source=True))
     assert not reconfiguration.wants_keyframe(30 * SECOND)
-    operating.pull(Levers(stills=False))
+    operating.decide(AutoDecisions(stills=False))
     assert reconfiguration.wants_keyframe(30 * SECOND)

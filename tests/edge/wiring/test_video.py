@@ -13,7 +13,7 @@ from hvt_edge.config import EdgeConfig, check, check_rate, with_profile
 from hvt_edge.source.opening import open_source
 from hvt_edge.stills.policy.m6 import ExpectedGain
 from hvt_edge.wiring import as_the_camera_is, base_size, default_size
-from hvt_edge.wiring.link import lever_settings
+from hvt_edge.wiring.link import auto_settings
 from hvt_edge.wiring.perception import make_method
 from media.hevc_camera import SIZE, write_clip
 
@@ -113,7 +113,7 @@ def test_auto_values_pixels_that_the_base_does_not_have(source, weight, finer):
     made = make_method(config, view)
     assert isinstance(made, ExpectedGain)
     assert made.detail_weight == pytest.approx(weight)
-    assert lever_settings(config, view).finer == finer
+    assert auto_settings(config, view).finer == finer
 
 
 def test_a_method_that_comes_back_has_the_parameters_it_began_with():
@@ -128,7 +128,7 @@ def test_a_method_that_comes_back_has_the_parameters_it_began_with():
 def test_stills_may_pause_where_nobody_wants_details(flags):
     """They would be sent for ever, for what the method does not value."""
     view = View.fitted((3840, 2160), (1280, 720), fit="letterbox")
-    assert not lever_settings(settings(*flags), view).finer
+    assert not auto_settings(settings(*flags), view).finer
 
 
 @pytest.mark.parametrize(

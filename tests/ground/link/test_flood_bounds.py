@@ -81,7 +81,7 @@ def test_an_edge_that_reports_without_end_does_not_talk_to_all_viewers(rig, flig
     real = Status.parse(item.payload)
     for number in range(1, 2000):
         rig.now_ns += SECOND_NS // 1000
-        rig.session.take(replace(real, sequence=real.sequence + number, levers=f"report {number}"), item)
+        rig.session.take(replace(real, sequence=real.sequence + number, decisions=f"report {number}"), item)
     rig.session.close()
     said = [one.text for one in rig.events if isinstance(one, Notice)]
     assert len([one for one in said if one.startswith("Report")]) == 61
@@ -100,9 +100,9 @@ def test_numbers_alone_are_no_event(rig, flight):
         "tracks: the video hides 9 objects; stills paused: they name 1 of 40 otherwise",
         "tracks: the video hides 8 objects; stills paused: they name 1 of 40 otherwise",
     ]
-    for number, levers in enumerate(said):
-        rig.session.take(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
-    assert rig.session.reception.levers == said[-1]
+    for number, decisions in enumerate(said):
+        rig.session.take(replace(real, sequence=real.sequence + 1 + number, decisions=decisions), item)
+    assert rig.session.reception.decisions == said[-1]
     assert [one.text for one in rig.events if isinstance(one, Notice)] == [
         "The edge sends no tracks: not measured yet. Stills may be sent: the ground has judged none yet.",
         (

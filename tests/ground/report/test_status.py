@@ -109,9 +109,9 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
     state = ground.maker.make([("uav-1", ground.sessions)])
     (edge,) = state.edges
     every = dict.fromkeys(STILL_WORDS, 2)
-    levers = "tracks: the video hides 31 objects; stills paused: they name 0 of 40 otherwise"
+    decisions = "tracks: the video hides 31 objects; stills paused: they name 0 of 40 otherwise"
     session = replace(
-        edge.session, still_outcomes=every, stills_not_sent=every, levers=levers, gaps=2, lost=3
+        edge.session, still_outcomes=every, stills_not_sent=every, decisions=decisions, gaps=2, lost=3
     )
     state = replace(state, edges=(replace(edge, session=session),), failed=ground.failures.now)
     shown = json.loads(state_message(state))["edges"]["uav-1"]

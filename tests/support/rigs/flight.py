@@ -334,7 +334,7 @@ class Flight:
             **counts,
             health=replace(_IDLE, frames_captured=base, frames_encoded=base),
             failed=(),
-            levers="",
+            decisions="",
         )
         return _received("status", report.pack(), b"", "")
 

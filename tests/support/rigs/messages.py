@@ -143,7 +143,7 @@ STATUS = Status(
             working=False,
         ),
     ),
-    levers="tracks: the video hides 31 objects",
+    decisions="tracks: the video hides 31 objects",
 )
 INFO = Info(
     session_id=7,

@@ -173,7 +173,7 @@ class Status(Message):
     dropped: Mapping[str, int] = wire_field(_REASONS)
     health: Health = wire_field(Nested(Health))  # noqa: RUF009 - a dataclass field, not a default
     failed: tuple[FailedPart, ...] = wire_field(ListOf(Nested(FailedPart), MOST_FAILED_PARTS))
-    levers: str = wire_field(Text(120))
+    decisions: str = wire_field(Text(120))
     """The decisions of ``auto`` with their reasons, one line for people; empty where settings alone decide."""
     frames: tuple[int, ...] = wire_field(ListOf(_COUNT, 32), default=())
     """How many source frames are in each group of `FRAME_GROUPS`, in its order, zeros at the end left out."""

@@ -156,7 +156,7 @@ def test_typical_sizes_are_small():
     assert len(replace(usual, capture_ns=-1).pack()) <= 62
     assert len(replace(usual, capture_ns=-1, parameters={}, codec="h264-intra").pack()) <= 50
     assert len(STEP.pack()) <= 45 + len(STEP.boxes)
-    assert len(replace(STATUS, failed=(), levers="").pack()) <= 190
+    assert len(replace(STATUS, failed=(), decisions="").pack()) <= 190
     assert len(REQUEST.pack()) <= 20
 
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from hvt_common.protocol.edge_words import LEVER_WORDS, lever_decisions
+from hvt_common.protocol.edge_words import DECISION_WORDS, each_decision
 from hvt_common.protocol.messages import Status
 from hvt_common.protocol.messages.envelope import kinds
 from hvt_edge.operating import Operating
-from hvt_edge.perception.levers import LeverControl, LeverSettings, Measured
+from hvt_edge.perception.auto import AutoControl, AutoSettings, Measured
 
 SECOND_NS = 1_000_000_000
-SETTINGS = LeverSettings(tracks_bps=8_000)
+SETTINGS = AutoSettings(tracks_bps=8_000)
 
 
 class Rig:
@@ -23,7 +23,7 @@ class Rig:
         self.operating = Operating(
             budget_bps=budget_bps, video_share=None, base_bps=budget_bps, method="M6", decimation=1
         )
-        self.control = LeverControl(self.operating, replace(SETTINGS, finer=finer))
+        self.control = AutoControl(self.operating, replace(SETTINGS, finer=finer))
         self.at_s = 0
 
     def tracks(
@@ -48,14 +48,14 @@ class Rig:
         return self.second().stills
 
     def second(self, seconds: int = 1):
-        """The levers so much later."""
+        """The decisions so much later."""
         self.at_s += seconds
         self.control.decide(self.at_s * SECOND_NS)
-        says = self.operating.now.levers.says
-        assert {one for one, _ in lever_decisions(says)} <= LEVER_WORDS.keys(), (
+        says = self.operating.now.decisions.says
+        assert {one for one, _ in each_decision(says)} <= DECISION_WORDS.keys(), (
             "the page has a sentence for each"
         )
-        return self.operating.now.levers
+        return self.operating.now.decisions
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_in_a_view_that_the_detector_does_not_know_its_tracks_have_no_credit():
     assert rig.tracks(0.3)
     rig.control.unlike = True
     assert not rig.tracks(0.3)
-    assert rig.operating.now.levers.says.startswith(
+    assert rig.operating.now.decisions.says.startswith(
         "no tracks: this view is unlike what the detector knows; "
     )
     rig.control.unlike = False
@@ -115,11 +115,11 @@ def test_what_it_says_has_room_in_a_report():
     crowd = Measured(3.0, -0.5, -0.5, hidden=99, suppressed=99, misnamed=99, reported=True)
     rig.control.measured = crowd
     assert rig.answers(SETTINGS.most_answers, changed=40)
-    says = rig.operating.now.levers.says
+    says = rig.operating.now.decisions.says
     assert says.startswith(
         "no tracks: the ground misses 99 objects, shows 99 false, misnames 99; stills show"
     )
-    assert dict(kinds(Status))["levers"].decode(says) == says, "a report refuses what is longer"
+    assert dict(kinds(Status))["decisions"].decode(says) == says, "a report refuses what is longer"
 
 
 def test_one_picture_is_no_measurement_unless_it_is_plain():
@@ -160,7 +160,7 @@ def test_stills_of_a_source_much_finer_than_the_base_never_pause():
     """Details are what they are for there: no class changes, and an operator could read nothing."""
     rig = Rig(finer=True)
     assert rig.answers(60)
-    assert rig.operating.now.levers.says.endswith("stills show details, they name 0 of 40 otherwise")
+    assert rig.operating.now.decisions.says.endswith("stills show details, they name 0 of 40 otherwise")
     rig.control.take_load(too_slow=True, now_ns=SECOND_NS)
     assert not rig.second().stills, "but on a machine that is too slow"
 
@@ -169,7 +169,7 @@ def test_stills_that_change_something_go_on():
     """The next one may be the one that matters."""
     rig = Rig()
     assert rig.answers(SETTINGS.most_answers, changed=5)
-    assert "stills: they name 5 of 40 otherwise" in rig.operating.now.levers.says
+    assert "stills: they name 5 of 40 otherwise" in rig.operating.now.decisions.says
 
 
 def test_stills_go_on_where_the_base_misnames_and_no_tracks_tell():
@@ -177,7 +177,7 @@ def test_stills_go_on_where_the_base_misnames_and_no_tracks_tell():
     rig = Rig()
     assert rig.answers(SETTINGS.most_answers) is False
     rig.tracks(0.0, misnamed_share=0.3)
-    assert rig.operating.now.levers.stills
+    assert rig.operating.now.decisions.stills
 
 
 def test_another_scene_begins_anew():
@@ -186,20 +186,20 @@ def test_another_scene_begins_anew():
     rig.tracks(0.1)
     assert not rig.answers(SETTINGS.least_answers)
     rig.control.forget()
-    levers = rig.second()
-    assert levers.stills
-    assert levers.says.startswith("no tracks: not measured yet")
+    decisions = rig.second()
+    assert decisions.stills
+    assert decisions.says.startswith("no tracks: not measured yet")
 
 
 def test_a_machine_that_is_too_slow_sends_video_alone_and_says_so():
-    """Perception that never comes to a frame would leave the last levers for ever."""
+    """Perception that never comes to a frame would leave the last decisions for ever."""
     rig = Rig()
     rig.tracks(0.1)
     rig.control.take_load(too_slow=True, now_ns=SECOND_NS)
-    levers = rig.operating.now.levers
-    assert not levers.tracks
-    assert not levers.stills
-    assert "too slow" in levers.says
+    decisions = rig.operating.now.decisions
+    assert not decisions.tracks
+    assert not decisions.stills
+    assert "too slow" in decisions.says
     rig.control.take_load(too_slow=False, now_ns=2 * SECOND_NS)
     assert rig.tracks(0.1), "it has time again"
 
@@ -212,5 +212,5 @@ def test_a_ground_that_lies_moves_stills_alone(lies):
     before = rig.operating.now
     rig.answers(1000, changed=1000 if lies else 0)
     now = rig.operating.now
-    assert now.levers.tracks == before.levers.tracks
+    assert now.decisions.tracks == before.decisions.tracks
     assert (now.total_bps, now.base_bps, now.decimation) == (before.total_bps, before.base_bps, 1)

@@ -19,7 +19,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from hvt_common.units import SECOND_NS
-from hvt_edge.operating import Levers, Operating
+from hvt_edge.operating import AutoDecisions, Operating
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class LeverSettings:
+class AutoSettings:
     """The thresholds at which tracks and stills are worth their bits. Gains are of F1, 0…1."""
 
     tracks_bps: int
@@ -87,10 +87,10 @@ class LeverSettings:
         return enough and self.net_gain(gain, total_bps=total_bps) >= self.least_gain
 
 
-class LeverControl:
-    """Takes measurements in the thread of perception, and sets ``operating.now.levers``. No clock of its own."""
+class AutoControl:
+    """Takes measurements in the thread of perception, and sets ``operating.now.decisions``. No clock of its own."""
 
-    def __init__(self, operating: Operating, settings: LeverSettings) -> None:
+    def __init__(self, operating: Operating, settings: AutoSettings) -> None:
         self._operating = operating
         self._settings = settings
         self._lock = threading.Lock()
@@ -102,7 +102,7 @@ class LeverControl:
         self._paused_until_ns: int | None = None
         self._pauses = 1
         self._too_slow = False
-        operating.pull(Levers(tracks=False))
+        operating.decide(AutoDecisions(tracks=False))
 
     def take_answer(self, *, changed: bool) -> None:
         """A ground has inspected a still; ``changed``: only by that still it names another object than the edge."""
@@ -123,27 +123,27 @@ class LeverControl:
         self._changed.clear()
         self._paused_until_ns, self._pauses = None, 1
 
-    def decide(self, now_ns: int) -> Levers:
+    def decide(self, now_ns: int) -> AutoDecisions:
         """Decide by the present measurements; ``now_ns`` is the time of the budget's windows."""
         with self._lock:
             return self._decide(now_ns)
 
-    def _decide(self, now_ns: int) -> Levers:
-        before = self._operating.now.levers
+    def _decide(self, now_ns: int) -> AutoDecisions:
+        before = self._operating.now.decisions
         tracks = self._tracks(before.tracks) and not self._too_slow
         # Tracks carry classes too; without tracks only a still can correct a class.
         named = tracks or self.measured.misnamed_share < self._settings.least_changed
         wanted = self._settings.finer or self._stills(now_ns) or not named
         stills = wanted and not self._too_slow
-        levers = Levers(tracks, stills, self._says(tracks=tracks, stills=stills))
-        if levers != before:
-            self._operating.pull(levers)
-        return levers
+        decisions = AutoDecisions(tracks, stills, self._says(tracks=tracks, stills=stills))
+        if decisions != before:
+            self._operating.decide(decisions)
+        return decisions
 
     @property
     def stable(self) -> bool:
         """Whether the decision on tracks stays the same if the gain changes by twice its last change."""
-        now, sent = self.measured, self._operating.now.levers.tracks
+        now, sent = self.measured, self._operating.now.decisions.tracks
         margin = max(self._settings.least_gain, 2 * now.moved)
         near = (replace(now, gain=now.gain + by, sure_gain=now.sure_gain + by) for by in (-margin, margin))
         bps = self._operating.now.total_bps
