@@ -175,6 +175,7 @@ class Letterboxer:
             _bits(((pixels - np.float32(mean)) * np.float32(scale)).astype(dtype))
             for mean, scale in zip(preparation.mean, preparation.scale, strict=True)
         ]
+        self._as_they_are = dtype == np.float32 and all(np.array_equal(one, pixels) for one in self._tables)
         self._dtype = dtype
         self._channels_last = channels_last
         self._input_size = (0, 0)
@@ -183,6 +184,7 @@ class Letterboxer:
         self._planes: Image
         self._tensor: npt.NDArray[Any]
         self._last: npt.NDArray[Any]
+        self._targets: npt.NDArray[Any]
 
     def fill(self, image_bgr: Image, input_size: tuple[int, int]) -> tuple[npt.NDArray[Any], Letterbox]:
         """Return the (1, 3, height, width) input, valid until the next call, and how the image lies on it.
@@ -203,11 +205,14 @@ class Letterboxer:
             image_bgr = self._resized
         for top in range(0, len(image_bgr), _ROWS_AT_ONCE):
             rows = image_bgr[top : top + _ROWS_AT_ONCE]
-            planes = list(self._planes[:, : len(rows)])
-            cv2.split(rows, planes)  # a tenth of the time of one channel after the other
-            ordered = planes[::-1] if self._rgb else planes
-            for plane, table, target in zip(ordered, self._tables, self._targets, strict=True):
-                cv2.LUT(plane, table, dst=target[top : top + len(rows)])
+            planes = self._planes[:, : len(rows)]
+            cv2.split(rows, list(planes))  # a tenth of the time of one channel after the other
+            ordered, targets = planes[:: -1 if self._rgb else 1], self._targets[:, top : top + len(rows)]
+            if self._as_they_are:  # half the time of tables
+                np.copyto(targets, ordered)
+                continue
+            for plane, table, target in zip(ordered, self._tables, targets, strict=True):
+                cv2.LUT(plane, table, dst=target)
         if not self._channels_last:
             return self._tensor, self._letterbox
         np.copyto(self._last, self._tensor.transpose(0, 2, 3, 1))
@@ -217,8 +222,7 @@ class Letterboxer:
         self._letterbox = Letterbox.fitted(image_size, input_size, anchor=self._anchor)
         self._input_size = input_size
         # The former input goes before the new one comes: 25 MB for a 1080p source.
-        self._resized = self._planes = self._tensor = self._last = np.empty(0, np.uint8)
-        self._targets: list[npt.NDArray[Any]] = []
+        self._resized = self._planes = self._tensor = self._last = self._targets = np.empty(0, np.uint8)
         left, top, wide, high = self._letterbox.content
         width, height = input_size
         self._resized = np.empty((0 if (wide, high) == image_size else high, wide, 3), np.uint8)
@@ -226,7 +230,7 @@ class Letterboxer:
         self._tensor = np.empty((1, 3, height, width), self._dtype)
         for plane, table in zip(_bits(self._tensor)[0], self._tables, strict=True):
             plane[:] = table[_FILL]
-            self._targets.append(plane[top : top + high, left : left + wide])
+        self._targets = _bits(self._tensor)[0, :, top : top + high, left : left + wide]
         if self._channels_last:
             self._last = np.empty((1, height, width, 3), self._dtype)
 

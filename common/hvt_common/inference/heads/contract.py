@@ -121,12 +121,12 @@ class YoloxCells:
             self._first_cells = len(cell_grid(input_size, self._first)[0])
             self._grid_size = input_size
         table = rows_of(outputs[0])
-        rows = np.flatnonzero(table[:, 4] >= confidence)
+        rows = (table[:, 4] >= confidence).nonzero()[0]
         picked, grid, stride = table[rows], self._grid[rows], self._stride[rows]
         scores, class_ids = best(picked[:, 5:], picked[:, 4])
         centres = (picked[:, :2] + grid) * stride
-        sides = np.exp(np.minimum(picked[:, 2:4], _MAX_LOG_SIZE)) * stride
-        boxes = corners(np.hstack([centres, sides]), "centre")
+        half: Array = np.exp(np.minimum(picked[:, 2:4], _MAX_LOG_SIZE)) * stride * np.float32(0.5)
+        boxes = np.hstack([centres - half, centres + half])
         second = None if self._first == self._strides else rows >= self._first_cells
         return valid(boxes, scores, class_ids, confidence, second=second)
 
