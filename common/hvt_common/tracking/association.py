@@ -82,21 +82,21 @@ def assign(cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
 def _assign(rows: _Indices, columns: _Indices, cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
     # From the pairs under the limit.
     by_row, by_column = np.bincount(rows), np.bincount(columns)
-    alone = (by_row.take(rows) == 1) & (by_column.take(columns) == 1)
-    lone_rows, lone_columns = rows[alone], columns[alone]
-    if len(lone_rows) == len(rows):
+    alone = by_row.take(rows) * by_column.take(columns) == 1
+    others = (~alone).nonzero()[0]
+    if not len(others):
         return rows, columns
+    lone_rows, lone_columns = rows[alone], columns[alone]
     by_row[lone_rows] = by_column[lone_columns] = 0
     open_rows, open_columns = by_row.nonzero()[0], by_column.nonzero()[0]
-    others = (~alone).nonzero()[0]
     contested = np.full((len(open_rows), len(open_columns)), limit + 1)
-    places = open_rows.searchsorted(rows[others]), open_columns.searchsorted(columns[others])
-    contested[places] = cost[others]
+    places = open_rows.searchsorted(rows.take(others)), open_columns.searchsorted(columns.take(others))
+    contested[places] = cost.take(others)
     picked, _ = lap.lapjv(contested, extend_cost=True, cost_limit=limit, return_cost=False)
     some = (picked >= 0).nonzero()[0]
     return (
-        np.concatenate((lone_rows, open_rows[some])),
-        np.concatenate((lone_columns, open_columns[picked[some]])),
+        np.concatenate((lone_rows, open_rows.take(some))),
+        np.concatenate((lone_columns, open_columns.take(picked.take(some)))),
     )
 
 

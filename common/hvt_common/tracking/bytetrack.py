@@ -260,8 +260,8 @@ class ByteTracker:
 
     def _mark_over_time(self, frame_index: int) -> None:
         table, oldest = self._table, frame_index - self._lost_frames - 1
-        late = ((table.phase == LOST) & (table.seen < oldest)).nonzero()[0]
-        if len(late):
+        if np.minimum.reduce(table.seen, initial=oldest) < oldest:
+            late = ((table.phase == LOST) & (table.seen < oldest)).nonzero()[0]
             table.phase[late] = OVER_TIME
             # The authors' program matches a frame longer (it sweeps one update late): the same at any rate.
             stale = (table.seen[late] < oldest - 1) & (table.since[late] != self._updated_index)
@@ -313,9 +313,9 @@ class ByteTracker:
         fresh = max(round(_OLD_S * self._fps), _OLD_GAPS * max(self._gaps, default=1))
         if len(self._gaps) == 1 and self._late_frames <= fresh:
             fresh = self._longest_frames  # nobody knows yet when the next update comes
-        area = (boxes[2] - boxes[0]) * (boxes[3] - boxes[1])
+        width, height = boxes[2:] - boxes[:2]
         listed = (table.phase >= TRACKED) & (table.seen >= frame_index - fresh)
-        rows = (listed & (area > self._settings.min_box_area_px2)).nonzero()[0]
+        rows = (listed & (width * height > self._settings.min_box_area_px2)).nonzero()[0]
         ids, born, seen, since, _ = table.numbers.take(rows, axis=1)
         scores = table.scores.take(rows, axis=1)
         return Tracks(

@@ -95,20 +95,21 @@ class Pictures:
 def move(table: TrackTable, step: Step, *, frames: int, hold_unconfirmed: bool) -> None:
     """Move all tracks to a frame, ``frames`` after the one before, in place."""
     states = table.states
-    then = states[kalman.POSITION].copy()
+    then = None if step.flow is None else states[kalman.POSITION].copy()
     for _ in range(frames - 1):
         kalman.coast(states)
     if hold_unconfirmed:
         # The authors' program matches unconfirmed tracks where they started, without the step to this frame.
         # They are at rest; it only changes the gain of the correction that confirms them.
-        before = states.copy()
+        held = (table.phase == UNCONFIRMED).nonzero()[0]
+        before = states.take(held, axis=2)
         kalman.predict(states)
-        np.copyto(states, before, where=table.phase == UNCONFIRMED)
+        states[:, :, held] = before
     else:
         kalman.coast(states)
     if step.affine is not None:
         kalman.warp(states, step.affine)
-    if step.flow is not None:
+    if then is not None and step.flow is not None:
         _carry(table, then, step.flow, frames=frames)
     heights = states[kalman.POSITION, 3]
     np.maximum(heights, table.heights / _MOST_GROWN, out=heights)

@@ -52,18 +52,20 @@ class TrackerInput:
         boxes = detections.boxes_xyxy_px.T.astype(np.float64, order="C")
         confidences, class_ids = detections.confidences, detections.class_ids
         # Comparisons with NaN are false: a box with one fails them all.
-        usable = (
-            (boxes[0] < boxes[2]) & (boxes[1] < boxes[3]) & (np.maximum.reduce(np.abs(boxes)) < _FARTHEST_PX)
-        )
-        usable &= (confidences > low_confidence) & (confidences < math.inf)
+        low, high = boxes[:2], boxes[2:]
+        whole = (low < high) & (low > -_FARTHEST_PX) & (high < _FARTHEST_PX)
+        usable = whole[0] & whole[1] & (confidences > low_confidence) & (confidences < math.inf)
         order = usable.nonzero()[0]
         ranked = confidences.take(order)
-        if np.count_nonzero(ranked[1:] >= ranked[:-1]):
+        in_order = not np.count_nonzero(ranked[1:] >= ranked[:-1])
+        if not in_order:
             order = order[np.lexsort((class_ids[order], *boxes[:, order], -ranked))]
-        boxes, class_ids = boxes.take(order, axis=1), class_ids.take(order)
+        if not in_order or len(order) < len(usable):
+            boxes, confidences = boxes.take(order, axis=1), confidences.take(order)
+            class_ids = class_ids.take(order)
         if np.count_nonzero(class_ids < 0):
             raise ValueError(f"class_ids holds {class_ids.min()}, must not be negative")
-        return cls(boxes, kalman.measure(boxes), confidences.take(order), class_ids)
+        return cls(boxes, kalman.measure(boxes), confidences, class_ids)
 
     def take(self, rows: _Indices) -> TrackerInput:
         """Some of them, in the order of ``rows``."""
