@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import signal
 import subprocess
 import sys
 import weakref
@@ -203,4 +204,5 @@ def write_truth_of(source: Source, path: Path | None, *, fps: float) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # whoever asked was killed: that is the end, and no fault
     _draw(int(sys.argv[1]), sys.argv[2])

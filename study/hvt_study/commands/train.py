@@ -62,8 +62,8 @@ class _Own:
             return inside_frame(view.to_base(boxes), size)
 
         own = self.labels
-        moved = FrameLabels(there(own.boxes_xyxy_px), own.ids, own.class_names, there(own.ignored_xyxy_px))
-        return shown, moved
+        passed = there(own.passed_xyxy_px)
+        return shown, FrameLabels.plain(there(own.boxes_xyxy_px), own.class_names, beside=passed)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
     def held_out_base() -> Iterator[HeldOut]:
         for own in held_out:
             image, there = own.base(size)
-            yield HeldOut(image, there.boxes_xyxy_px, there.ignored_xyxy_px, frozenset(classes))
+            yield HeldOut(image, there.boxes_xyxy_px, there.passed_xyxy_px, frozenset(classes))
 
     before = _scored(start, held_out, size, classes, confidence=_confidence(start))
     # Beside FILE.onnx, for there is room; with a name that nobody has.
@@ -259,8 +259,8 @@ def _say(train: Sequence[_Own], held_out: Sequence[_Own], classes: Sequence[str]
 def _rows(labels: FrameLabels, classes: Sequence[str]) -> tuple[Boxes, npt.NDArray[np.int32]]:
     """Boxes and class ids; -1 where the labels say that nothing counts."""
     kinds = [classes.index(name) for name in labels.class_names]
-    boxes = np.concatenate([labels.boxes_xyxy_px, labels.ignored_xyxy_px])
-    return boxes, np.array([*kinds, *[-1] * len(labels.ignored_xyxy_px)], np.int32)
+    passed = labels.passed_xyxy_px
+    return np.concatenate([labels.boxes_xyxy_px, passed]), np.array([*kinds, *[-1] * len(passed)], np.int32)
 
 
 def _frames(path: Path, held_out: Sequence[_Own], size: _Size) -> list[LabelledFrame]:

@@ -64,6 +64,11 @@ class FrameLabels:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def passed_xyxy_px(self) -> Boxes:
+        """(M + P, 4) float32: regions and objects in which nothing is known to be background."""
+        return np.concatenate([self.ignored_xyxy_px, self.beside_xyxy_px])
+
 
 @dataclass(slots=True)
 class LabelDoubts:
@@ -98,7 +103,7 @@ class LabelDoubts:
         """From (class, x1 y1 x2 y2, place in words), times ``scale``, in a picture of this (width, height).
 
         Boxes are cut at the picture. Boxes without area inside, and repeated ones, are left out; boxes of
-        `IGNORED` become regions.
+        `IGNORED` stand beside: in COCO and VOC objects in front of them count.
         """
         names, boxes, wheres = zip(*rows, strict=True) if rows else ((), (), ())
         corners = np.array(boxes, np.float64).reshape(-1, 4) * (scale * 2)
@@ -122,7 +127,7 @@ class LabelDoubts:
         kinds = [name for name, *_ in once]
         passed = np.array([name.casefold() in IGNORED for name in kinds], bool)
         judged = [name for name, skip in zip(kinds, passed, strict=True) if not skip]
-        return FrameLabels.plain(found[~passed], judged, ignored=found[passed])
+        return FrameLabels.plain(found[~passed], judged, beside=found[passed])
 
     def sentences(self) -> list[str]:
         said = []

@@ -354,7 +354,10 @@ def drawn_by(monkeypatch) -> list[subprocess.Popen]:
 
 
 def test_a_demo_whose_drawing_was_stopped_for_a_moment_goes_on(monkeypatch, drawn_by):
-    """In a container, whose Python has no buffers, half a picture came, and the flight stood still for good."""
+    """In a container, whose Python has no buffers, half a picture came, and the flight stood still for good.
+
+    After `kill -9` of its reader a traceback of it stood on the screen.
+    """
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     with open_source("demo", size=(64, 64), fps=5, max_frames=2) as source:
         frames = source.frames(start_ns=0)
@@ -370,6 +373,9 @@ def test_a_demo_whose_drawing_was_stopped_for_a_moment_goes_on(monkeypatch, draw
         eventually(lambda: psutil.Process(drawing.pid).status() == "stopped", what="it is stopped")
         drawing.send_signal(signal.SIGCONT)
         assert len(list(frames)) == 1
+        next(source.frames(start_ns=0))
+        drawing.stdout.close()
+        assert drawing.wait(timeout=60) == -signal.SIGPIPE
 
 
 def test_a_demo_that_nobody_draws_any_more_ends_with_a_sentence(drawn_by):

@@ -448,7 +448,9 @@ def test_what_coco_says_of_classes_and_crowds_counts(tmp_path: Path) -> None:
     text(tmp_path / "labels.json", json.dumps(about))
     ((one, labels),) = read(tmp_path)
     assert labels.class_names == ("bus",)
-    assert labels.ignored_xyxy_px.tolist() == [[100, 10, 120, 30]]
+    assert labels.beside_xyxy_px.tolist() == [[100, 10, 120, 30]]
+    assert not len(labels.ignored_xyxy_px), "pycocotools counts what stands before a crowd"
+    assert labels.passed_xyxy_px.tolist() == [[100, 10, 120, 30]], "it would be taught as background"
     assert "2 labels were left out" in doubts_of([one])[0]
 
 
@@ -528,7 +530,7 @@ def test_an_xml_is_read_in_its_encoding_and_difficult_objects_do_not_count(
     text(tmp_path / "b.xml", voc().replace("</name>", "</name><difficult>1</difficult>"))
     (_, first), (_, second) = read(tmp_path)
     assert first.class_names == ("lärm",)
-    assert (len(second), second.ignored_xyxy_px.tolist()) == (0, [BOX])
+    assert (len(second), second.beside_xyxy_px.tolist()) == (0, [BOX])
 
 
 def test_folders_of_a_yaml_that_lie_in_each_other_count_once(tmp_path: Path) -> None:

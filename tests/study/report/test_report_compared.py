@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from hvt_common.errors import UserError
 from hvt_study import cli
@@ -19,7 +21,7 @@ from hvt_study.report.data.pairs import EqualQuality, pairs
 from hvt_study.report.data.table_file import write_results
 from hvt_study.report.example.choice import CropExample, Example, Timeline, choose_run
 from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
-from hvt_study.report.figures.drawing import PALETTE, style_of
+from hvt_study.report.figures.drawing import PALETTE, log_axis, style_of
 from hvt_study.report.figures.example_figures import crop_pictures
 from hvt_study.report.figures.pair_figures import difference_figures
 from hvt_study.report.make import make_report
@@ -385,6 +387,20 @@ def test_codecs_are_shown_over_the_bytes_of_their_stills():
     assert "M5 avif" in figure.svg
     (bare,) = settings([{**one, "mean_still_bytes": None} for one in rows])
     assert codec_figure(bare, name="codecs-1") is None
+    (alike,) = settings(
+        [{**one, "mean_still_bytes": size} for one, size in zip(rows, (3000.0, 3300.0), strict=True)]
+    )
+    figure = codec_figure(alike, name="codecs-1")
+    assert len(set(re.findall(r">(3\d\d\d)<", figure.svg))) > 1, "one mark alone tells no scale"
+
+
+def test_marks_of_an_axis_do_not_touch():
+    """Those of 1.25 and 1.6 were one number; of many budgets none could be read."""
+    axes = Figure(figsize=(7.2, 2)).subplots(1, 4)[0]
+    axes.set_xscale("log")
+    axes.set_xlim(0.1, 10)
+    log_axis(axes, (1, 2, 0.5, 5, 0.8, 1.25, 1.6))
+    assert sorted(axes.get_xticks()) == [1, 5]
 
 
 def test_figures_of_an_earlier_report_go_and_what_is_not_ours_stays(tmp_path):

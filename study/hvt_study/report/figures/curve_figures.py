@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hvt_study.report.data.arms import Arm, BySequence, Setting, values
 from hvt_study.report.data.captions import INTERVALS, METRICS, interval_of, mean_of, under
 from hvt_study.report.data.document import Drawing
-from hvt_study.report.figures.drawing import drawn, fill_of, plain_axes, rate_axis, style_of
+from hvt_study.report.figures.drawing import drawn, fill_of, log_axis, plain_axes, rate_axis, style_of
 
 _UTILITY = ("named_f1", "top1_all", "map_50")
 _CODEC = ("named_f1", "confidence_gain", "stills_per_min")
@@ -73,8 +74,8 @@ def codec_figure(setting: Setting, *, name: str) -> Drawing | None:
                 for method in dict.fromkeys(arm.method for arm in setting.arms(regime)):
                     _draw_codecs(axes, setting, regime, method, column, codecs=codecs)
                 axes.set_title(f"{METRICS[column].title}, {regime}")
-                axes.set_xscale("log")
                 plain_axes(axes)
+        grid[0][0].set_xscale("log")
         _size_marks(grid[0][0])
         for axes in grid[-1]:
             axes.set_xlabel("bytes/still")
@@ -93,8 +94,8 @@ def codec_figure(setting: Setting, *, name: str) -> Drawing | None:
         height_in=0.7 + 1.7 * len(regimes),
         caption=(
             f"Codec curves, {setting.name}: what each method shows with each still codec, over the mean size that "
-            f"its stills have with it; mean and {INTERVALS}. Each codec sends as many as the budget carries. "
-            f"{under(setting)}"
+            f"its stills have with it; mean and {INTERVALS}. Gain is of confidence, by the still. Each codec sends "
+            f"as many as the budget carries. {under(setting)}"
         ),
         alternative="Figures of each method with each still codec over the size of stills",
     )
@@ -171,15 +172,10 @@ def _sizes(setting: Setting, arm: Arm) -> list[float]:
 
 
 def _size_marks(axes: Axes) -> None:
-    low, high = axes.get_xlim()
-    marks = [step * 10**power for power in range(1, 7) for step in (1, 2, 5)]
-    inside = [mark for mark in marks if low <= mark <= high]
-    if len(inside) < 2:
-        middle = math.sqrt(low * high)
-        inside = [round(value, 1 - int(math.log10(value))) for value in (low, middle, high)]
-        inside = [value for value in inside if low <= value <= high]
-    axes.set_xticks(inside, [f"{mark:g}" for mark in inside])
-    axes.minorticks_off()
+    log_axis(axes, [step * 10**power for power in range(1, 7) for step in (1, 2, 5)])
+    if len(axes.get_xticks()) < 3:
+        axes.xaxis.set_major_locator(MaxNLocator(3))
+        axes.xaxis.set_major_formatter("{x:g}")
 
 
 def _budget_kbps(setting: Setting, regime: str) -> float:

@@ -6,7 +6,8 @@ The rate-utility plot of a comparison: utility over the bits that were really sp
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -24,6 +25,8 @@ WIDTH_IN = 7.2
 INK = "#000000"
 """Becomes the page's own colour of text in HTML."""
 GREY = "#808080"
+_MARK_IN = 0.36
+"""A label of five digits, and a space."""
 
 PALETTE: Mapping[str, str] = MappingProxyType(
     {
@@ -120,15 +123,25 @@ def plain_axes(axes: Axes, *, grid: str = "both") -> None:
     axes.set_axisbelow(True)
 
 
-def rate_axis(axes: Axes, kbps: list[float]) -> None:
-    """A logarithmic axis of bitrates with marks at these, as far as they do not touch each other."""
+def log_axis(axes: Axes, wanted: Iterable[float]) -> None:
+    """A logarithmic axis, marked at those of these values that lie in it and have room, earlier ones first."""
     axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    apart = math.log(high / low) * _MARK_IN * axes.figure.dpi / axes.bbox.width
     marks: list[float] = []
-    for value in sorted(set(kbps)):
-        if not marks or value > 1.25 * marks[-1]:
+    for value in wanted:
+        if low <= value <= high and all(abs(math.log(value / one)) >= apart for one in marks):
             marks.append(value)
     axes.set_xticks(marks, [f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in marks])
     axes.minorticks_off()
+
+
+def rate_axis(axes: Axes, kbps: Sequence[float]) -> None:
+    """One of bitrates, which holds all of these and marks them."""
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.set_xlim(min(low, *kbps), max(high, *kbps))
+    log_axis(axes, sorted(set(kbps)))
 
 
 def drawn(
@@ -153,6 +166,8 @@ def drawn(
 _MEASURES = (("named_f1", "named F1 of the list"), ("false_per_frame", "false objects a frame"))
 _ONE_TARGET = (("recall", "share of its time at which the target is found"), ("gaps", "gaps"))
 _DPI = 200
+_TITLE = 60
+"""Letters of a clip's name for which there is room."""
 
 
 def plot(result: CompareResult, path: Path) -> None:
@@ -169,9 +184,11 @@ def plot(result: CompareResult, path: Path) -> None:
         axes.set_xlabel("kbps in all, every byte counted")
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside right center", frameon=False)
+    clip = result.clip if len(result.clip) <= _TITLE else f"…{result.clip[-_TITLE:]}"
     figure.suptitle(
-        f"{result.clip}: the ground's list over the whole clip, {result.labels} labels",
+        f"{clip}: the ground's list over the whole clip, {result.labels} labels",
         fontsize="medium",
+        parse_math=False,
     )
     figure.savefig(path, dpi=_DPI, metadata={"Software": None})
 

@@ -15,14 +15,14 @@ from hvt_study.report.data.arms import Setting
 from hvt_study.report.data.captions import INTERVALS, METRICS, under
 from hvt_study.report.data.document import Drawing
 from hvt_study.report.data.pairs import EqualQuality, Pair
-from hvt_study.report.figures.drawing import GREY, INK, drawn, plain_axes, style_of
+from hvt_study.report.figures.drawing import GREY, INK, drawn, log_axis, plain_axes, style_of
 
 _One = TypeVar("_One", Pair, EqualQuality)
 _ROW_IN = 0.19
 _DOT = 9.0
 _LEFT, _RIGHT = r"$\leftarrow$", r"$\rightarrow$"
 _THIN: Mapping[str, Any] = MappingProxyType({"markeredgewidth": 0.2, "linestyle": "none", "zorder": 4})
-_RATIO_MARKS = (0.1, 0.2, 0.5, 0.8, 1.0, 1.25, 1.6, 2.0, 3.0, 5.0, 10.0, 20.0)
+_RATIO_MARKS = (1.0, 2.0, 0.5, 5.0, 0.2, 10.0, 0.1, 20.0, 0.8, 1.25, 1.6, 3.0)
 
 
 def difference_figures(
@@ -76,11 +76,8 @@ def _ratios(setting: Setting, found: Sequence[EqualQuality], *, name: str, colum
     low, high = min(0.8, *read) / 1.15, max(1.25, *read) * 1.15
 
     def finish(axes: Axes, reference: str) -> None:
-        axes.set_xscale("log")
         axes.set_xlim(low / 1.08, high * 1.08)
-        marks = [mark for mark in _RATIO_MARKS if low <= mark <= high]
-        axes.set_xticks(marks, [f"{mark:g}" for mark in marks])
-        axes.minorticks_off()
+        log_axis(axes, _RATIO_MARKS)
         axes.set_title(f"bits of {reference}")
 
     title = METRICS[column].title
