@@ -62,6 +62,8 @@ class Shot:
     """For ``--encoder passthrough``; ``image`` then decodes it, and is not called otherwise."""
     missed: int = 0
     """Frames that came between the one before and this one, and were not taken in time."""
+    damaged: int = 0
+    """Frames between the two that could not be decoded."""
 
 
 class SignalLost(Exception):  # noqa: N818 - an event, not a fault of the program
@@ -196,6 +198,7 @@ class LiveSource(Source):
 
     def _take(self, shot: Shot, capture_ns: int, *, jitter_ns: int) -> None:
         # A frame has come (the reader's thread); those of the last ``jitter_ns`` may have come with it.
+        self.unreadable += shot.damaged
         if not self._gate.accept(capture_ns):
             self.missed += shot.missed
             self.passed_over += 1

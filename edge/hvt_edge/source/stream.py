@@ -20,7 +20,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_common.units import SECOND_NS
 from hvt_edge.source.contract import Notes
-from hvt_edge.source.decoding.container import DEMUX_OPTIONS, cause_of, choose_stream, is_local
+from hvt_edge.source.decoding.container import DEMUX_OPTIONS, cause_of, choose_stream, decode, is_local
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 
@@ -141,16 +141,20 @@ def is_stamped(container: Any) -> bool:
 
 
 def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
-    # Undecodable packets are left out: joined between keyframes, or losses.
+    # Undecodable packets are left out: joined between keyframes, and not counted, or losses.
     times: dict[Fraction, int] = {}
+    damaged: int | None = None
     until_s, stamped = time.monotonic() + FIRST_S, is_stamped(container)
     for packet in packets_of(container, stream):
         camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
-        decoded = []
-        with suppress(av.error.FFmpegError):
-            decoded = packet.decode()
+        try:
+            decoded = decode(stream, packet)
+        except av.error.FFmpegError:
+            decoded, damaged = [], None if damaged is None else damaged + 1
+        if any(frame.is_corrupt for frame in decoded):
+            pictures.say("damaged pictures come, shown as the decoder has patched them")
         if decoded:
             until_s = time.monotonic() + _UNDECODED_S
         elif time.monotonic() > until_s:
@@ -160,7 +164,8 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
                 base = frame.time_base
                 at_s = None if frame.pts is None or base is None else frame.pts * base
                 camera_ns = None if at_s is None else times.pop(at_s, None)
-                yield Shot(partial(pictures.bgr, frame), camera_ns)
+                yield Shot(partial(pictures.bgr, frame), camera_ns, damaged=damaged or 0)
+                damaged = 0
         if len(times) > _MOST_TIMES:
             times.clear()
 

@@ -15,7 +15,7 @@ from media.numbered import number_of, numbered
 
 @pytest.fixture
 def camera():
-    """Serves `numbered` pictures until it is closed; ``/cut`` without the first boundary, ``/jpg`` of that kind."""
+    """Serves `numbered` pictures; ``/cut`` without the first boundary, ``/jpg`` of that kind, ``/torn`` halves."""
     stop = threading.Event()
 
     class Handler(BaseHTTPRequestHandler):
@@ -31,6 +31,7 @@ def camera():
             number = 0
             while not stop.wait(0.02):
                 data = cv2.imencode(".jpg", numbered(number % 1000))[1].tobytes()
+                data = data[: len(data) // 2] if self.path == "/torn" and number % 2 else data
                 form = "jpg" if self.path == "/jpg" else "jpeg"
                 head = f"Content-Type: image/{form}\r\nContent-Length: {len(data)}\r\n\r\n".encode()
                 between = b"--frame\r\n" if number or self.path != "/cut" else b""
@@ -59,6 +60,15 @@ def test_a_camera_plays_whatever_its_boundaries(camera, path):
         numbers = [number_of(frame.source_bgr) for frame in source.frames(start_ns=0)]
     assert len(numbers) == 5
     assert numbers == sorted(numbers)
+
+
+def test_a_picture_that_is_cut_is_left_out_and_counted(camera):
+    """In its place was half of an older one, and nobody knew how many came so."""
+    with open_source(f"{camera}/torn", size=(320, 240), fps=25, max_frames=5) as source:
+        numbers = [number_of(frame.source_bgr) for frame in source.frames(start_ns=0)]
+        assert source.unreadable
+    assert len(numbers) == 5
+    assert not any(number % 2 for number in numbers)
 
 
 def test_a_page_is_no_camera(camera):

@@ -55,6 +55,7 @@ _FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0", "m3u8_hold_counters":
 _PLAYLIST, _IN_SEGMENTS = ".m3u8", "hls"
 _WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
+_JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
 _TS_BYTES = (188, 192, 204)
 """Size of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
 
@@ -215,7 +216,7 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
     for packet in packets_of(container, stream):
         if first is None:
             with suppress(av.error.FFmpegError):
-                first = next(iter(_decode(stream, packet)), None)
+                first = next(iter(decode(stream, packet)), None)
         if not isinstance(packet, Exception) and packet.size:
             base = packet.time_base
             times.append((_seconds(packet.pts, base), _seconds(packet.dts, base)))
@@ -241,10 +242,13 @@ def decoded(
     timeline = stamps.timeline(stream)
     reading = _Reading(container, stream)
     before_s: Fraction | None = None
-    paused = False
+    paused, lost = False, 0
     segments = container.format.name == _IN_SEGMENTS
     pause_s = max(1 if segments else LONG_STEP_S, 3 * stamps.period_s)
     for frame in reading.frames():
+        for _ in range(0 if stamps.usable else reading.damaged - lost):
+            timeline.at(None)  # or all that follows would come too early
+        lost = reading.damaged
         stamp = frame.pts if stamps.ordered else frame.dts
         jumped = bool(timeline.jumps)
         at_s = timeline.at(_seconds(stamp, frame.time_base) if stamps.usable else None)
@@ -270,7 +274,7 @@ class _Reading:
         self._container, self._stream = container, stream
         self._size = _size_of(container)
         self._begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)  # guessed later
-        self._damaged = self._shown_damaged = self._count = self._lossy = 0
+        self.damaged = self._shown_damaged = self._count = self._lossy = 0
         self._ended = ""
         self.end_s: Fraction | None = None
         """End of the film by its time stamps, as far as these go on."""
@@ -290,17 +294,17 @@ class _Reading:
                     end_s = Fraction(stamp + (packet.duration or 0)) * (packet.time_base or 0)
                     self.end_s = max(end_s, self.end_s or end_s)
             try:
-                frames = _decode(self._stream, packet)
+                frames = decode(self._stream, packet)
             except av.error.FFmpegError:
-                self._damaged += 1
+                self.damaged += 1
                 continue
             self._shown_damaged += sum(frame.is_corrupt for frame in frames)
             yield from frames
 
     def faults(self) -> Iterator[str]:
-        if self._damaged:
+        if self.damaged:
             codec = self._stream.codec_context.name
-            yield f"has {self._damaged} packets, damaged or of another codec than {codec}, which were skipped"
+            yield f"has {self.damaged} packets, damaged or of another codec than {codec}, which were skipped"
         if self._shown_damaged:
             yield f"has {self._shown_damaged} damaged pictures, shown as the decoder has patched them"
         if self._lossy:
@@ -378,11 +382,28 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
         yield packet
 
 
-def _decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
-    # Decode a packet; after an error, the pictures that the decoder has held back.
+def decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
+    """The pictures of a packet, of the stream's own codec; after an error those that the decoder has held back.
+
+    Raises `FFmpegError` for a damaged packet.
+    """
     if isinstance(packet, Exception):
         return list(stream.codec_context.decode(None))
+    if stream.codec_context.name == "mjpeg" and _is_truncated(bytes(packet)):
+        raise av.error.InvalidDataError(1, "it breaks off")
     return list(packet.decode())
+
+
+def _is_truncated(jpeg: bytes) -> bool:
+    # Whether a JPEG breaks off: FFmpeg would go on with an older picture there.
+    if jpeg.rfind(_JPEG_SCAN) <= jpeg.rfind(_JPEG_END):
+        return False
+    strict = av.CodecContext.create("mjpeg", "r")  # some cameras leave out the mark of its end alone
+    strict.options = {"err_detect": "explode"}
+    try:
+        return not strict.decode(av.Packet(jpeg))
+    except av.error.FFmpegError:
+        return True
 
 
 def _lacks_index(path: Path) -> str:

@@ -57,7 +57,7 @@ class Pictures:
     """The pictures of one stream, for as long as it is read; ``notes`` has the decisions and their reasons."""
 
     def __init__(self, notes: Notes) -> None:
-        self._say = notes
+        self.say = notes
         self._reformatter = VideoReformatter()
         """Reused: the table of an HDR picture takes seconds to make."""
         self._stretch = Stretch(notes)
@@ -82,12 +82,10 @@ class Pictures:
     def _checked_aspect(self, said: Fraction | None) -> Fraction:
         aspect = Fraction(said or 1)
         if not Fraction(1, _MOST_ASPECT) <= aspect <= _MOST_ASPECT:
-            self._say(
-                f"pixels {float(aspect):g} times as wide as high are taken for a fault: they are square"
-            )
+            self.say(f"pixels {float(aspect):g} times as wide as high are taken for a fault: they are square")
             return Fraction(1)
         if aspect != 1:
-            self._say(f"its pixels are {float(aspect):.3g} times as wide as high: made square")
+            self.say(f"its pixels are {float(aspect):.3g} times as wide as high: made square")
         return aspect
 
     def _note(self, frame: av.VideoFrame) -> None:
@@ -112,7 +110,7 @@ class Pictures:
             return
         if frame is not None and self._shape_of(frame) != (self._shape if self._graph else None):
             yield from self._drained()
-            self._say("its film is interlaced: bwdif makes whole pictures of it")
+            self.say("its film is interlaced: bwdif makes whole pictures of it")
             self._make_graph(frame)
         if frame is None:
             yield from self._drained()
@@ -125,7 +123,7 @@ class Pictures:
         picture = self._upright_colours(frame)
         turn = _turn_of(frame) or self._held_turn or _UPRIGHT
         if said := _TURNS[turn]:
-            self._say(f"it is to be shown {said}, and is")
+            self.say(f"it is to be shown {said}, and is")
             picture = _turned(picture, turn)
         return np.ascontiguousarray(picture)
 
@@ -146,10 +144,10 @@ class Pictures:
                 standard = "BT.709" if matrix == _BT709 else "BT.601"
                 said = int(frame.colorspace)
                 which = "no colour matrix" if said in _UNSAID else f"colour matrix {said}, which FFmpeg lacks"
-                self._say(f"it says {which}: {standard}, because it has {frame.height} lines")
+                self.say(f"it says {which}: {standard}, because it has {frame.height} lines")
                 more["src_colorspace"] = Colorspace.ITU709 if matrix == _BT709 else Colorspace.ITU601
             if frame.color_trc in _HDR:
-                self._say(f"it is HDR ({_HDR[frame.color_trc]}): tone-mapped to BT.709")
+                self.say(f"it is HDR ({_HDR[frame.color_trc]}): tone-mapped to BT.709")
                 more |= {"dst_color_trc": ColorTrc.BT709, "dst_color_primaries": ColorPrimaries.BT709}
         how = Interpolation.BICUBIC if (wide, high) != (frame.width, frame.height) else Interpolation.BILINEAR
         converted = self._reformatter.reformat(

@@ -402,17 +402,23 @@ def test_a_matrix_that_nobody_converts_goes_by_height(tmp_path):
     assert "it says colour matrix 8, which FFmpeg lacks: BT.601" in " ".join(source.notes)
 
 
-def test_a_picture_whose_header_is_damaged_is_held_over(tmp_path, caplog):
-    """One of four would end the flight in a traceback."""
-    for number in range(4):
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_picture_that_is_damaged_is_held_over(tmp_path, caplog, cut):
+    """One of four would end the flight in a traceback, or one that is cut be half grey, or half of an older one."""
+    film = []
+    for number in range(5):
         data = bytearray(cv2.imencode(".jpg", numbered(number))[1].tobytes())
-        if number == 2:
+        if number == 2 and cut:
+            del data[len(data) // 2 :]
+        elif number == 2:
             at = data.index(b"\xff\xc0") + 5
             data[at : at + 4] = b"\xff\xdc\xff\xdc"
         (tmp_path / f"{number}.jpg").write_bytes(data)
-    _, pictures = play(tmp_path)
-    assert numbers(pictures) == [0, 1, 1, 3]
-    assert "2.jpg cannot be read" in caplog.text
+        film.append(data if number != 3 else data[:-2])  # as of some cameras, and whole
+    (tmp_path / "a.mjpeg").write_bytes(b"".join(film))
+    for place, says in (("", "2.jpg cannot be read"), ("a.mjpeg", "has 1 packets, damaged")):
+        assert numbers(play(tmp_path / place, fps=25)[1]) == [0, 1, 1, 3, 4]
+        assert says in caplog.text
 
 
 @pytest.mark.parametrize("name", ["2026-01-26T20:57:04Z.mp4", "rtsp: a & b.mp4", "100%.mp4", "clip@2x.mp4"])
