@@ -17,7 +17,7 @@ _ECCENTRICITY2 = 6.69437999014e-3
 _Degrees = TypeVar("_Degrees", float, npt.NDArray[np.float64])
 
 
-def turned_deg(degrees: _Degrees) -> _Degrees:
+def wrap_180(degrees: _Degrees) -> _Degrees:
     """The same direction from -180 up to 180; of a difference the shorter way round."""
     return (degrees + 180) % 360 - 180
 
@@ -38,10 +38,10 @@ def moved(latitude_deg: float, longitude_deg: float, *, north_m: float, east_m: 
     """Latitude and longitude of a place ``north_m`` and ``east_m`` away, degrees; longitude from -180 up to 180."""
     north, east = metres_per_degree(latitude_deg)
     longitude = longitude_deg + east_m / max(east, 1e-6)
-    return latitude_deg + north_m / north, turned_deg(longitude)
+    return latitude_deg + north_m / north, wrap_180(longitude)
 
 
-def between(first: Pose, second: Pose, capture_ns: int) -> Pose:
+def interpolate(first: Pose, second: Pose, capture_ns: int) -> Pose:
     """The pose at a time on the line through two, also before or behind them; ``first`` is the earlier one.
 
     A value that only one of them knows is missing. Angles turn the shorter way. Errors are those of the worse pose.
@@ -56,18 +56,18 @@ def between(first: Pose, second: Pose, capture_ns: int) -> Pose:
             return None
         pitch = one.pitch_deg + (other.pitch_deg - one.pitch_deg) * share
         return Orientation(
-            (one.yaw_deg + turned_deg(other.yaw_deg - one.yaw_deg) * share) % 360,
+            (one.yaw_deg + wrap_180(other.yaw_deg - one.yaw_deg) * share) % 360,
             max(-90.0, min(90.0, pitch)),
-            turned_deg(one.roll_deg + turned_deg(other.roll_deg - one.roll_deg) * share),
+            wrap_180(one.roll_deg + wrap_180(other.roll_deg - one.roll_deg) * share),
         )
 
     latitude = first.latitude_deg + (second.latitude_deg - first.latitude_deg) * share
-    longitude = first.longitude_deg + turned_deg(second.longitude_deg - first.longitude_deg) * share
+    longitude = first.longitude_deg + wrap_180(second.longitude_deg - first.longitude_deg) * share
     return replace(
         first,
         capture_ns=capture_ns,
         latitude_deg=max(-90.0, min(90.0, latitude)),
-        longitude_deg=turned_deg(longitude),
+        longitude_deg=wrap_180(longitude),
         height_m=line(first.height_m, second.height_m),
         altitude_m=line(first.altitude_m, second.altitude_m),
         camera=turn(first.camera, second.camera),

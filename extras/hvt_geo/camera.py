@@ -11,7 +11,7 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.geodesy import metres_per_degree, moved, turned_deg
+from hvt_common.geodesy import metres_per_degree, moved, wrap_180
 from hvt_common.values import Boxes, Pose, View
 from hvt_ground.events import Places
 from hvt_ground.poses import Footprint, Locator
@@ -139,7 +139,7 @@ def places_of_boxes(
     places = np.stack(
         (
             pose.latitude_deg + metres[:, 0] / north_m,
-            turned_deg(pose.longitude_deg + metres[:, 1] / max(east_m, 1e-6)),
+            wrap_180(pose.longitude_deg + metres[:, 1] / max(east_m, 1e-6)),
         ),
         axis=1,
     )

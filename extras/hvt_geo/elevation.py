@@ -28,7 +28,7 @@ from rasterio.warp import reproject, transform, transform_bounds
 from rasterio.windows import Window
 
 from hvt_common.errors import UserError, absent
-from hvt_common.geodesy import metres_per_degree, turned_deg
+from hvt_common.geodesy import metres_per_degree, wrap_180
 from hvt_common.runtime.failures import RetryPause
 from hvt_common.values import Pose
 from hvt_geo.camera import LEAST_DEPRESSION_DEG, Points, Rays
@@ -86,7 +86,7 @@ class Tile:
         high, wide = self.metres.shape
         area = self.area
         middle_deg = (area.west_deg + area.east_deg) / 2
-        east_deg = middle_deg + turned_deg(longitude_deg - middle_deg)
+        east_deg = middle_deg + wrap_180(longitude_deg - middle_deg)
         x = (east_deg - area.west_deg) / (area.east_deg - area.west_deg) * wide - 0.5
         y = (area.north_deg - latitude_deg) / (area.north_deg - area.south_deg) * high - 0.5
         inside = (x >= -0.5) & (x <= wide - 0.5) & (y >= -0.5) & (y <= high - 0.5)
@@ -325,7 +325,7 @@ class Terrain:
         failure = None
         with self._lock:
             north_m, east_m = metres_per_degree(pose.latitude_deg)
-            east_deg = turned_deg(pose.longitude_deg - self._middle[1]) if self._tile else math.inf
+            east_deg = wrap_180(pose.longitude_deg - self._middle[1]) if self._tile else math.inf
             off_m = math.hypot((pose.latitude_deg - self._middle[0]) * north_m, east_deg * east_m)
             outside = self._tile is None or not off_m <= TILE_M - _REACH_M
             if outside and self._retry.due(self._clock()):

@@ -8,7 +8,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, replace
 from typing import Final
 
-from hvt_common.geodesy import between, metres_per_degree, turned_deg
+from hvt_common.geodesy import interpolate, metres_per_degree, wrap_180
 from hvt_common.protocol.messages import PoseDecoder, PoseReport
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Orientation, Pose, View
@@ -69,7 +69,7 @@ class PoseTrail:
         if after < len(poses):
             later = poses[after]
             if later.capture_ns - last.capture_ns <= STALE_S * SECOND_NS:
-                return between(last, later, capture_ns)
+                return interpolate(last, later, capture_ns)
         if after < 2 or age_ns == 0:
             return replace(last, capture_ns=capture_ns)
         return _continued(poses[after - 2], last, capture_ns)
@@ -80,12 +80,12 @@ def _continued(before: Pose, last: Pose, capture_ns: int) -> Pose:
     age_ns = capture_ns - last.capture_ns
     if lasted_ns > STALE_S * SECOND_NS:
         return replace(last, capture_ns=capture_ns)
-    ahead = between(before, last, last.capture_ns + min(age_ns, SECOND_NS))
+    ahead = interpolate(before, last, last.capture_ns + min(age_ns, SECOND_NS))
     share = _DRIFT * age_ns / lasted_ns
     north_m, east_m = metres_per_degree(last.latitude_deg)
     way_m = math.hypot(
         (last.latitude_deg - before.latitude_deg) * north_m,
-        turned_deg(last.longitude_deg - before.longitude_deg) * east_m,
+        wrap_180(last.longitude_deg - before.longitude_deg) * east_m,
     )
     climbed_m = abs((last.height_m or 0.0) - (before.height_m or 0.0))
     return replace(
@@ -107,9 +107,9 @@ def _turn_deg(first: Orientation | None, second: Orientation | None) -> float:
     if first is None or second is None:
         return 0.0
     changes = (
-        turned_deg(second.yaw_deg - first.yaw_deg),
+        wrap_180(second.yaw_deg - first.yaw_deg),
         second.pitch_deg - first.pitch_deg,
-        turned_deg(second.roll_deg - first.roll_deg),
+        wrap_180(second.roll_deg - first.roll_deg),
     )
     return max(abs(one) for one in changes)
 

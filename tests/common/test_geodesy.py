@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvt_common.geodesy import between, metres_per_degree, moved, turned_deg
+from hvt_common.geodesy import interpolate, metres_per_degree, moved, wrap_180
 from hvt_common.values import Orientation, Pose
 
 
@@ -30,16 +30,16 @@ def test_longitudes_go_round():
     """A ship that crosses the date line would jump around the world."""
     assert moved(0.0, 179.9999, north_m=0, east_m=100)[1] == pytest.approx(-179.9992, abs=1e-4)
     first, second = Pose(0, 0.0, 179.9998), Pose(10, 0.0, -179.9998)
-    assert abs(between(first, second, 5).longitude_deg) == pytest.approx(180.0, abs=1e-9)
-    assert [turned_deg(one) for one in (-190.0, 179.0, 180.0, 540.0)] == [170.0, 179.0, -180.0, -180.0]
-    assert turned_deg(np.array([-190.0, 0.0, 180.0])).tolist() == [170.0, 0.0, -180.0]
+    assert abs(interpolate(first, second, 5).longitude_deg) == pytest.approx(180.0, abs=1e-9)
+    assert [wrap_180(one) for one in (-190.0, 179.0, 180.0, 540.0)] == [170.0, 179.0, -180.0, -180.0]
+    assert wrap_180(np.array([-190.0, 0.0, 180.0])).tolist() == [170.0, 0.0, -180.0]
 
 
 def test_angles_turn_the_shorter_way():
     """A camera that pans through north would sweep over the whole horizon between two poses."""
     first = Pose(0, 1.0, 2.0, camera=Orientation(350, -80, 170), height_m=10)
     second = Pose(10, 1.0, 2.0, camera=Orientation(20, -90, -170), height_m=20)
-    middle = between(first, second, 5)
+    middle = interpolate(first, second, 5)
     assert middle.camera is not None
     assert middle.camera.yaw_deg == pytest.approx(5)
     assert middle.camera.pitch_deg == pytest.approx(-85)
@@ -49,6 +49,6 @@ def test_angles_turn_the_shorter_way():
 
 def test_what_only_one_knows_is_not_known_between():
     """A pose would be made up of a value that nobody measured there."""
-    middle = between(Pose(0, 1.0, 2.0, height_m=10), Pose(10, 1.0, 2.0, position_error_m=9), 5)
+    middle = interpolate(Pose(0, 1.0, 2.0, height_m=10), Pose(10, 1.0, 2.0, position_error_m=9), 5)
     assert middle.height_m is None
     assert middle.position_error_m == 9

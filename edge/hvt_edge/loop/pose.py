@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from typing import Final, Protocol, cast
 
 from hvt_common.errors import UserError
-from hvt_common.geodesy import between
+from hvt_common.geodesy import interpolate
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import PoseEncoder, PoseReport
 from hvt_common.runtime.failures import Failures
@@ -97,7 +97,7 @@ class PoseTable:
         if 0 < after < len(self._poses):
             first, second = self._poses[after - 1], self._poses[after]
             if second.capture_ns - first.capture_ns <= self._most_gap_ns:
-                return between(first, second, media_ns)
+                return interpolate(first, second, media_ns)
         nearest = self._poses[max(0, after - 1)]
         return nearest if abs(nearest.capture_ns - media_ns) <= _BEYOND_NS else None
 

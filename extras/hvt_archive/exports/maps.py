@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hvt_common.errors import UserError
-from hvt_common.geodesy import metres_per_degree, moved, turned_deg
+from hvt_common.geodesy import metres_per_degree, moved, wrap_180
 from hvt_common.units import SECOND_NS, utc_text
 from hvt_ground.recordings.row import Recorded
 from hvt_ground.sinks.palette import class_colour
@@ -81,7 +81,7 @@ class _Track:
         return any(
             math.hypot(
                 (one.latitude_deg - first.latitude_deg) * north_m,
-                turned_deg(one.longitude_deg - first.longitude_deg) * east_m,
+                wrap_180(one.longitude_deg - first.longitude_deg) * east_m,
             )
             > reach_m
             for one in self.spots
@@ -267,7 +267,7 @@ def parts_of(way: Sequence[Fix]) -> list[list[Fix]]:
 
 def _crossing(before: Fix, after: Fix, side_deg: float) -> Fix:
     """Between two places, where the line through them is at 180 or -180 degrees."""
-    across_deg = turned_deg(after.longitude_deg - before.longitude_deg)
+    across_deg = wrap_180(after.longitude_deg - before.longitude_deg)
     share = (side_deg - before.longitude_deg) / across_deg if across_deg else 0.0
     heights = before.height_m, after.height_m
     return Fix(

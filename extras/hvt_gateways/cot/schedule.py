@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from hvt_common.geodesy import metres_per_degree, turned_deg
+from hvt_common.geodesy import metres_per_degree, wrap_180
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_gateways.cot.event import Motion
@@ -138,5 +138,5 @@ class MotionTrail:
 def metres_between(first: Place, second: Place) -> tuple[float, float]:
     """Metres north and east from one to the other, some kilometres at the most."""
     north, east = metres_per_degree(first[0])
-    turned = turned_deg(second[1] - first[1])
+    turned = wrap_180(second[1] - first[1])
     return (second[0] - first[0]) * north, turned * east

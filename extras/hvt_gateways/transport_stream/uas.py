@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.geodesy import turned_deg
+from hvt_common.geodesy import wrap_180
 from hvt_common.values import Orientation, Pose, View
 from hvt_ground.events import Overlay
 from hvt_ground.poses import NOWHERE, Footprint, Locator
@@ -220,7 +220,7 @@ def _ground_items(pose: Pose, ground: Footprint) -> Iterator[tuple[int, bytes]]:
         yield 25, _altitude(pose.altitude_m - ground.below_m)
     if ground.corners is None:
         return
-    offsets = [(north - latitude, turned_deg(east - longitude)) for north, east in ground.corners]
+    offsets = [(north - latitude, wrap_180(east - longitude)) for north, east in ground.corners]
     if all(abs(one) <= _CORNER_DEG for offset in offsets for one in offset):
         for number, offset in enumerate(offsets):
             yield 26 + 2 * number, signed(offset[0], _CORNER_DEG, size=2)
@@ -294,7 +294,7 @@ def _target(
     ]
     if centre is not None and overlay.places is not None:
         latitude, longitude = overlay.places.places_deg[row].tolist()
-        across = turned_deg(longitude - centre[1])
+        across = wrap_180(longitude - centre[1])
         offsets = [imapb(one, -_OFFSET_DEG, _OFFSET_DEG, size=3) for one in (latitude - centre[0], across)]
         if all(offsets):
             items += [item(10, offsets[0]), item(11, offsets[1])]

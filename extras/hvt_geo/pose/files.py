@@ -24,7 +24,7 @@ import numpy as np
 
 from hvt_common.errors import UserError, telling
 from hvt_common.files import decoded, read_bytes
-from hvt_common.geodesy import turned_deg
+from hvt_common.geodesy import wrap_180
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 from hvt_edge.loop.pose import MOST_GAP_S, PoseTable
@@ -190,7 +190,7 @@ def _together(poses: list[Pose], path: Path) -> list[Pose]:
     for step in (1, 2):  # beside one that is wrong stands a good one
         north, east, passed_s = (places[step:] - places[:-step]).T
         wide = np.cos(np.radians(places[step:, 0]))
-        metres = _M_A_DEGREE * np.hypot(north, turned_deg(east) * wide)
+        metres = _M_A_DEGREE * np.hypot(north, wrap_180(east) * wide)
         near = metres <= _MOST_M + _MOST_SPEED * passed_s
         good[step:] |= near
         good[:-step] |= near

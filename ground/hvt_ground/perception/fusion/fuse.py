@@ -184,9 +184,9 @@ class Fusion:
         for edge_id, row in listed.items():
             if edge_id in self._by_edge:
                 self._update_edge(self._by_edge[edge_id], step, row)
-        self._welcome(step, fresh)
+        self._associate(step, fresh)
         if own is not None:
-            self._part(own, frame_index)
+            self._split(own, frame_index)
         self._update(own, frame_index)
         if own is not None:
             self._note_own(own, frame_index)
@@ -261,21 +261,21 @@ class Fusion:
         entity.last_frame = max(entity.last_frame, frame_index)
         entity.edge_vote.update(int(self._edge_classes[step.class_ids[row]]), confidence)
 
-    def _welcome(self, step: Tracks, fresh: Sequence[int]) -> None:
+    def _associate(self, step: Tracks, fresh: Sequence[int]) -> None:
         # Find which of the edge's new tracks continue one that it no longer lists; the others are new entities.
         frame_index = step.frame_index
         merged = [
             entity
             for entity in self._entities
-            if (entity.edge_id is None or entity.missed) and self._is_far(entity, frame_index)
+            if (entity.edge_id is None or entity.missed) and self._is_edge_only(entity, frame_index)
         ]
-        heirs: dict[int, Entity] = {}
+        continued: dict[int, Entity] = {}
         if merged and fresh:
-            overlaps = iou(self._far_boxes(merged, frame_index), step.boxes_xyxy_px[fresh])
-            heirs = {fresh[column]: merged[line] for line, column in _pairs(overlaps)}
+            overlaps = iou(self._reported_boxes(merged, frame_index), step.boxes_xyxy_px[fresh])
+            continued = {fresh[column]: merged[line] for line, column in _pairs(overlaps)}
         for row in fresh:
             edge_id = int(step.ids[row])
-            entity = heirs.get(row)
+            entity = continued.get(row)
             if entity is None:
                 entity = self._add(Entity(edge_id=edge_id, born=min(frame_index, int(step.born_frames[row]))))
             else:
@@ -288,7 +288,7 @@ class Fusion:
         entity.edge_id, entity.missed = edge_id, 0
         self._by_edge[edge_id] = entity
 
-    def _part(self, own: Tracks, frame_index: int) -> None:
+    def _split(self, own: Tracks, frame_index: int) -> None:
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
         for entity in list(self._entities):
             row = rows.get(entity.own_id) if entity.own_id is not None else None
@@ -325,12 +325,16 @@ class Fusion:
 
     def _pair(self, own: Tracks, frame_index: int) -> None:
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
-        theirs = [one for one in self._entities if one.own_id not in rows and self._is_far(one, frame_index)]
+        theirs = [
+            one for one in self._entities if one.own_id not in rows and self._is_edge_only(one, frame_index)
+        ]
         if not theirs:
             return
-        ours = [one for one in self._entities if one.own_id in rows and not self._is_far(one, frame_index)]
+        ours = [
+            one for one in self._entities if one.own_id in rows and not self._is_edge_only(one, frame_index)
+        ]
         places = [rows[one.own_id] for one in ours if one.own_id is not None]
-        overlaps = iou(own.boxes_xyxy_px[places], self._far_boxes(theirs, frame_index))
+        overlaps = iou(own.boxes_xyxy_px[places], self._reported_boxes(theirs, frame_index))
         classes = np.array([one.edge_vote.class_id for one in theirs])
         same = own.class_ids[places][:, None] == classes[None]
         for line, column in _pairs(overlaps, bonus=CLASS_BONUS * same):
@@ -372,10 +376,10 @@ class Fusion:
         self._by_own = {key: one for key, one in self._by_own.items() if id(one) not in merged}
         self._by_edge = {key: one for key, one in self._by_edge.items() if id(one) not in merged}
 
-    def _is_far(self, entity: Entity, frame_index: int) -> bool:
+    def _is_edge_only(self, entity: Entity, frame_index: int) -> bool:
         return entity.is_report_live(frame_index, patience=self._rules.patience)
 
-    def _far_boxes(self, entities: Sequence[Entity], frame_index: int) -> npt.NDArray[np.float64]:
+    def _reported_boxes(self, entities: Sequence[Entity], frame_index: int) -> npt.NDArray[np.float64]:
         return reported_boxes(entities, frame_index, path=self._path, reach=self._rules.reach)
 
 
