@@ -153,15 +153,24 @@ class Edge:
                 if not self._counts.encoded:
                     raise
                 broken = error
-                self._failures.failed(_PART, str(error), said=True)
             finally:
                 stages.stills.chooser.close()
                 self._say_goodbye(stages, link)
-        unreached = "" if self._reached else link.trouble or "nobody subscribed to its video"
-        content = summary(stages.heartbeat, unreached=unreached)
         if broken is not None:
-            raise FlightError(str(broken), summary=content) from broken
-        return content
+            raise self._broken_off(str(broken)) from broken
+        return self._summary(stages.heartbeat)
+
+    def given_up(self) -> FlightError:
+        """The end of a run that hangs after ``stop`` was set; for another thread."""
+        return self._broken_off(self._failures.hanging)
+
+    def _broken_off(self, reason: str) -> FlightError:
+        self._failures.failed(_PART, reason, said=True)
+        return FlightError(reason, summary=self._heartbeat and self._summary(self._heartbeat))
+
+    def _summary(self, heartbeat: Heartbeat) -> dict[str, Any]:
+        unreached = "" if self._reached else heartbeat.link.trouble or "nobody subscribed to its video"
+        return summary(heartbeat, unreached=unreached)
 
     def _play(self, source: Source, stages: Stages, link: EdgeLink, line: StatusLine) -> None:
         next_status_ns = restarts = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
@@ -13,6 +14,7 @@ from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import START_LOGGER, start_log
 from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.process import (
+    ended_in_time,
     leave,
     limit_malloc_arenas,
     put_video_first,
@@ -91,7 +93,8 @@ def _run(argv: Sequence[str] | None) -> int:
             write_json(config.summary, content)
 
     with log.ending():
-        content = reported(Edge(config, stop=stop, on_started=log.release, world=world).run, report)
+        edge = Edge(config, stop=stop, on_started=log.release, world=world)
+        content = reported(partial(ended_in_time, edge.run, stop, otherwise=edge.given_up), report)
     return 1 if in_vain(content) else 0
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import FlightError
 from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import reason_of
+from hvt_common.runtime.failures import Failures, Turns, reason_of
 from hvt_common.runtime.plug_ins import health_server
 from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
@@ -53,6 +54,29 @@ _MOST_MOVED = 256
 """Limit of edges that have left, for the same reason."""
 
 
+class _Watcher:
+    # Shows a service of an extra how all edges are, in a thread of its own: one that hangs holds nothing else.
+
+    def __init__(self, service: Service, failures: Failures) -> None:
+        self._service, self._failures = service, failures
+        self._states = queue.SimpleQueue[GroundState | None]()
+        threading.Thread(target=self._run, name="hvt-watcher", daemon=True).start()
+
+    def show(self, state: GroundState) -> None:
+        if self._states.empty():
+            self._states.put(state)
+
+    def close(self) -> None:
+        self._states.put(None)
+
+    def _run(self) -> None:
+        part = part_of(self._service)
+        turns = Turns(part, self._failures)
+        while (state := self._states.get()) is not None:
+            with turns:
+                self._failures.attempt(part, self._service.show, None, state)
+
+
 class Ground:
     """One run of a ground: build it, `run` it once. ``on_started()`` is called once nothing is refused any more.
 
@@ -83,6 +107,7 @@ class Ground:
         )
         """By edge, the summaries of sessions and the sinks that wrote them."""
         self._began_s = time.monotonic()
+        self._models: Models | None = None
         self._state: GroundState | None = None
 
     def run(self) -> list[dict[str, Any]]:
@@ -93,13 +118,19 @@ class Ground:
         the run within seconds.
         """
         check_outputs(self._config, records=self._program is None)
-        models = Models(self._config)
+        models = self._models = Models(self._config)
         try:
             self._fly(models)
         except FlightError as error:
             error.summary = self._summaries(models)
             raise
         return self._summaries(models)
+
+    def given_up(self) -> FlightError:
+        """The end of a run that hangs after ``stop`` was set; for another thread."""
+        if self._models is None:
+            return FlightError("it was stopped before it had begun")
+        return FlightError(self._models.failures.hanging, summary=self._summaries(self._models))
 
     def _fly(self, models: Models) -> None:
         config = self._config
@@ -122,6 +153,8 @@ class Ground:
                 one.serve(config, clock=self._clock, failures=models.failures) for one in extras_of(config)
             )
             services = [stack.enter_context(one) for one in offered if one is not None]
+            looking = [one for one in services if getattr(one.show, "__func__", None) is not Service.show]
+            watchers = [stack.enter_context(closing(_Watcher(one, models.failures))) for one in looking]
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
             session = stack.enter_context(open_session(settings, failures=models.failures))
@@ -168,7 +201,7 @@ class Ground:
             )
             try:
                 try:
-                    self._serve(link, factory, line, watch, models, services, group)
+                    self._serve(link, factory, line, watch, models, watchers, group)
                     models.give_up()
                 finally:
                     self._close_edges()
@@ -204,7 +237,7 @@ class Ground:
         line: StatusLine,
         watch: LinkWatch,
         models: Models,
-        services: Sequence[Service],
+        watchers: Sequence[_Watcher],
         group: GroundGroup | None,
     ) -> None:
         config, polls = self._config, 0
@@ -234,8 +267,8 @@ class Ground:
             if polls % _STATUS_EVERY_POLLS == 0:
                 give_back_holes()
                 self._state = maker.make(sorted(self._edges.items()))
-                for one in services:
-                    models.failures.attempt(part_of(one), one.show, None, self._state)
+                for one in watchers:
+                    one.show(self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
             if config.once and self._all_ended(loading=models.loading):
                 return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
@@ -11,7 +12,13 @@ from hvt_common.errors import UserError, exit_with_sentence, needs_extra
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
 from hvt_common.runtime.plug_ins import loaded, the_one
-from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
+from hvt_common.runtime.process import (
+    ended_in_time,
+    leave,
+    limit_malloc_arenas,
+    put_video_first,
+    stop_on_signals,
+)
 
 _DESCRIPTION = """Receive what edges publish over Zenoh: decode, detect, track, refine classes by
 the stills, and record all of it for the Rerun viewer.
@@ -86,7 +93,8 @@ def _run(argv: Sequence[str] | None) -> int:
             write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
 
     with log.ending():
-        reported(Ground(config, stop=stop, on_started=log.release).run, report)
+        ground = Ground(config, stop=stop, on_started=log.release)
+        reported(partial(ended_in_time, ground.run, stop, otherwise=ground.given_up), report)
     return 0
 
 

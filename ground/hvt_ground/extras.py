@@ -126,7 +126,7 @@ class Service:
 class Extra(Generic[Options]):
     """The parts that an extra may bring; each method gets the whole configuration, an instance of ``options``."""
 
-    options: ClassVar[type[GroundConfig]]
+    options: ClassVar[type[GroundConfig]] = GroundConfig
     """A frozen dataclass without slots whose further fields are declared by `hvt_common.config.Group`."""
     exports: ClassVar[Mapping[str, Callable[[Recorded, Path], None]]] = {}
     """Kinds of ``hvt-ground export``, each with its writer: a file that ends in the kind's name."""
@@ -184,7 +184,8 @@ def extras_of(config: GroundConfig) -> list[Extra[Any]]:
 @cache
 def config_class(extras: tuple[Extra[Any], ...] | None = None) -> type[GroundConfig]:
     """`GroundConfig` with the settings of ``extras``, by default all; settings of absent ones are refused."""
-    options = [extra.options for extra in (all_extras() if extras is None else extras)]
+    options = dict.fromkeys(extra.options for extra in (all_extras() if extras is None else extras))
+    options.pop(GroundConfig, None)  # of an extra without settings
     whole = make_dataclass("GroundConfig", (), bases=(*options, GroundConfig), frozen=True)
     known = {field.name.replace("_", "-") for field in fields(whole)}
     absent = {name: _ABSENT.format(package) for name, package in _BROUGHT_BY.items() if name not in known}

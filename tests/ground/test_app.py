@@ -158,6 +158,23 @@ def test_an_extra_that_raises_takes_nothing_with_it(
     assert run.sessions == []
 
 
+def test_an_extra_that_hangs_holds_itself_alone(
+    free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page that did not return from a state kept the ground from new edges, and from its end."""
+    brings, shown, hung = Brings(), list[Any](), threading.Event()
+    monkeypatch.setattr(brings.service, "show", lambda state: (shown.append(state), hung.wait()))
+    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
+    run = Run(config(free_port, tmp_path))
+    try:
+        eventually(lambda: shown, what="a state")
+        run.stop.set()
+        eventually(lambda: run.over, what="the ground has ended")
+        assert len(shown) == 1, "the newest state waits for no earlier one"
+    finally:
+        hung.set()
+
+
 def test_a_group_learns_of_the_page_whatever_else_is_served(
     free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

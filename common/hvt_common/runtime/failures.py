@@ -102,6 +102,14 @@ class Failures:
             if not (one.working or one.over)
         )
 
+    @property
+    def hanging(self) -> str:
+        """That the program hangs as it ends, a sentence, and which of its parts do not answer."""
+        with self._lock:
+            names = sorted(one.name for one in self._watched if one.count % 2)
+        where = f": {', '.join(names)}" if names else ""
+        return f"it was stopped, and something in it hangs{where}; what was written until then is kept"
+
     def failed(self, part: str, reason: str, *, last: bool = False, said: bool = False) -> int:
         """It has stopped, for the how manieth time. The log says so once, however often it is tried in vain.
 
@@ -193,7 +201,7 @@ class Turns:
     def __init__(
         self, name: str, failures: Failures, *, clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        self._name, self._failures, self._clock = name, failures, clock
+        self.name, self._failures, self._clock = name, failures, clock
         self.count = 0
         """Begun and ended, or left for an inner one: odd while it is asked."""
         self._seen = 0, 0
@@ -216,7 +224,7 @@ class Turns:
         if self._hangs:
             self._hangs = False
             if kind is None:
-                self._failures.works(self._name)
+                self._failures.works(self.name)
 
     def check(self) -> None:
         """Say that it hangs, where it does."""
@@ -225,7 +233,7 @@ class Turns:
             self._seen = count, now_ns
         elif count % 2 and not self._hangs and now_ns - self._seen[1] > SILENT_NS:
             self._hangs = True
-            self._failures.failed(self._name, f"no answer for {SILENT_NS // SECOND_NS} s")
+            self._failures.failed(self.name, f"no answer for {SILENT_NS // SECOND_NS} s")
 
     @staticmethod
     def goes_on() -> None:

@@ -11,6 +11,7 @@ import atexit
 import contextlib
 import ctypes
 import functools
+import math
 import os
 import signal
 import socket
@@ -31,6 +32,9 @@ _ZENOH_CALLBACK = "(pyo3-closure)"
 """Zenoh's Python package runs each callback in a thread of such a name, and joins none."""
 _JOIN_WITHIN_S = 30.0
 _CHECK_EVERY_S = 0.1
+_SECOND_SIGNAL_S = 1.0
+_END_WITHIN_S = 9.0
+"""systemd (TimeoutStopSec of deploy/) and Docker kill it after 10 s."""
 
 # Parameters of mallopt, glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
@@ -49,13 +53,36 @@ allocator_set = threading.Event()
 def stop_on_signals() -> threading.Event:
     """Return an event that these signals set from now on, so that the run ends with its summary and files whole.
 
-    ``nohup`` has SIGHUP ignored, and so it stays.
+    A second one ends the process at once, with the code of a shell; not one that comes with the first, as from a
+    terminal and ``timeout``. ``nohup`` has SIGHUP ignored, and so it stays.
     """
     stop = threading.Event()
+    began_s = math.inf
+
+    def heed(number: int, _frame: object) -> None:
+        nonlocal began_s
+        if time.monotonic() - began_s > _SECOND_SIGNAL_S:
+            os._exit(128 + number)
+        began_s = min(began_s, time.monotonic())
+        stop.set()
+
     for one in STOP_SIGNALS:
         if one is not signal.SIGHUP or signal.getsignal(one) is not signal.SIG_IGN:
-            signal.signal(one, lambda *_: stop.set())
+            signal.signal(one, heed)
     return stop
+
+
+def ended_in_time(run: Callable[[], T], stop: threading.Event, *, otherwise: Callable[[], Exception]) -> T:
+    """Run it in a thread, and return its result; raise ``otherwise()`` where something hangs after ``stop`` is set.
+
+    The main thread is left to signals: one that is in a native library heeds none.
+    """
+    done = _in_thread(run, name="hvt-run")
+    while not wait([done], timeout=_CHECK_EVERY_S).done and not stop.is_set():
+        pass
+    if not wait([done], timeout=_END_WITHIN_S).done:
+        raise otherwise()
+    return done.result()
 
 
 def interrupt_on_signals() -> None:
@@ -136,10 +163,18 @@ def put_video_first() -> None:
 
 def in_thread(call: Callable[[], T], *, name: str) -> Future[T]:
     """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too."""
+
+    def lowered() -> T:
+        lower_priority()
+        return call()
+
+    return _in_thread(lowered, name=name)
+
+
+def _in_thread(call: Callable[[], T], *, name: str) -> Future[T]:
     done: Future[T] = Future()
 
     def run() -> None:
-        lower_priority()
         try:
             done.set_result(call())
         except BaseException as error:  # noqa: BLE001 - raised where it is waited for

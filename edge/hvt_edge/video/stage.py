@@ -13,7 +13,7 @@ import numpy as np
 
 from hvt_common.errors import FlightError, foreign
 from hvt_common.protocol.edge_words import FrameGroup
-from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.failures import Failures, Turns
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
@@ -173,6 +173,7 @@ class BaseStage:
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
         self._coding_began_ns = self._coding_ns = 0
         """When the newest frame came to the encoder, and the recent mean of the coding time."""
+        self._turns = Turns(_PART, self.failures)
         self._begins_anew = False
         """The encoder was opened again, or a frame that others build on was left out: the next is a keyframe."""
 
@@ -225,9 +226,10 @@ class BaseStage:
             if decision.reconfigures:
                 self._at_keyframe(frame.index, now_ns=now_ns)
             regions = [] if self.regions is None else self.regions.regions(tracks)
-            unit = self.encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
-            if decision.to_link:
-                unit = self._within_a_window(unit, frame, now_ns=now_ns, may_open=not decision.to_store)
+            with self._turns:
+                unit = self.encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
+                if decision.to_link:
+                    unit = self._within_a_window(unit, frame, now_ns=now_ns, may_open=not decision.to_store)
         except foreign() as error:
             if self.open_again is None:
                 raise

@@ -141,11 +141,13 @@ def test_of_parts_that_hang_in_one_another_the_inner_one_is_said():
         with inner:
             assert failing() == []
             assert failing() == ["detector"]
+            assert "hangs: detector;" in failures.hanging
         for _ in range(3):
             outer.goes_on()
             assert failing() == []
         assert failing() == ["perception"]
     assert not failures.now
+    assert "hangs;" in failures.hanging
 
 
 def test_a_part_that_hangs_is_said_until_it_answers(caplog):

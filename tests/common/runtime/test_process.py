@@ -35,6 +35,41 @@ def test_each_way_to_stop_a_program_ends_it_in_order(one):
     assert stop.is_set()
 
 
+STOPPED = """
+import sys, threading
+from hvt_common.errors import FlightError
+from hvt_common.runtime import process
+
+process._SECOND_SIGNAL_S, process._END_WITHIN_S = 0.0, float(sys.argv[1])
+stop = process.stop_on_signals()
+
+def hang():
+    print("began", flush=True)
+    stop.wait()
+    print("heard", flush=True)
+    threading.Event().wait()
+
+try:
+    process.ended_in_time(hang, stop, otherwise=lambda: FlightError("it hangs"))
+except FlightError:
+    process.leave(1)
+"""
+
+
+@pytest.mark.parametrize("one", STOP_SIGNALS)
+@pytest.mark.parametrize("again", [False, True])
+def test_a_program_that_hangs_needs_no_kill(one, again):
+    """An encoder, a driver or an extra that did not answer: two Ctrl-C were not heard, nor what systemd sends."""
+    within = "60" if again else "0.1"
+    with subprocess.Popen([sys.executable, "-c", STOPPED, within], stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout.readline() == "began\n"
+        run.send_signal(one)
+        assert run.stdout.readline() == "heard\n"
+        if again:
+            run.send_signal(one)
+        assert run.wait(60) == (128 + one if again else 1)
+
+
 def test_nohup_is_heeded():
     """A flight that was started to outlive its terminal would end with it."""
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
