@@ -51,6 +51,38 @@ def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path)
     assert summary["frames_captured"] == FRAMES
 
 
+def test_an_edge_that_hangs_is_reported(tmp_path):
+    """All that was counted would be lost with it, and the reason."""
+    write_scene(tmp_path, frames=FRAMES)
+    config = EdgeConfig(
+        source=str(tmp_path), source_fps=FPS, fps=FPS, size="320x192", preset="ultrafast", method="M0",
+        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0,
+    )  # fmt: skip
+    hung, goes_on = threading.Event(), threading.Event()
+
+    class HangingWorld(World):
+        def open_source(self, config: EdgeConfig) -> Source:
+            def before(frame: Frame) -> None:
+                if frame.index == 3:
+                    hung.set()
+                    goes_on.wait()
+
+            return PassedOn(super().open_source(config), before=before)
+
+    edge = Edge(check(config), stop=threading.Event(), world=HangingWorld())
+    assert edge.given_up().summary is None, "nothing is known yet"
+    run = threading.Thread(target=edge.run)
+    run.start()
+    try:
+        assert hung.wait(60)
+        summary = edge.given_up().summary
+    finally:
+        goes_on.set()
+        run.join()
+    assert summary["frames_captured"] == 3
+    assert "hangs" in next(one["reason"] for one in summary["failed"] if one["part"] == "flight")
+
+
 class CountingWorld(World):
     """Notes each detector that is opened."""
 

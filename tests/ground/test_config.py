@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
 from hvt_ground.config import GroundConfig
-from hvt_ground.extras import checked, config_class
+from hvt_ground.extras import Extra, all_extras, checked, config_class
 from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.wiring import check_outputs, make_folders, output_path, set_aside
 from hvt_ground.wiring.sessions import backlog_path, free_path
@@ -228,3 +228,8 @@ def test_a_device_is_never_taken_for_an_empty_file(tmp_path):
     assert nothing == {"empty": True, "link": False, "pipe": False}
     assert not has_nothing(Path("/dev/full"))
     assert has_nothing(tmp_path / "new")
+
+
+def test_an_extra_needs_no_settings() -> None:
+    """One that brings a sink alone would end each start with a traceback."""
+    assert config_class((Extra(), *all_extras(), Extra())) is not None
