@@ -81,6 +81,11 @@ class Folders:
         return None if name is None else folder / name
 
 
+def in_any_case(path: Path) -> Path:
+    """The file or folder of this path with its names in whatever case they are there; the path where none is."""
+    return Folders().find(path) or path
+
+
 def _plain(name: str) -> str:
     # An accent may be a letter's own, or one behind it, as macOS writes it.
     return unicodedata.normalize("NFC", name).lower()

@@ -29,6 +29,7 @@ from hvt_study.datasets.label_files import (
     check_strange,
     class_file,
     coco_files,
+    in_any_case,
     keypoint_columns,
     label_file,
     number_of,
@@ -138,7 +139,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
         return [LabelledPicture(place, None, ())]
     if not place.is_dir():
         raise UserError(f"{place} does not exist; a picture, a folder of pictures or a COCO file is expected")
-    if (place / _TRUTH).is_file():
+    if in_any_case(place / _TRUTH).is_file():
         return _mot_pictures(place)
     files = pictures_below(place)
     if not files:

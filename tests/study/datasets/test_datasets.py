@@ -244,6 +244,25 @@ def test_uavdt_labels(tmp_path):
     assert labels.ignored_xyxy_px.tolist() == [[100, 0, 160, 20], [0, 0, 30, 10]], "both, of one number"
 
 
+@pytest.mark.parametrize("case", [str.upper, str.lower])
+@pytest.mark.parametrize("scheme", ["visdrone", "uavdt", "mot"])
+def test_folders_and_files_may_have_names_in_any_case(tmp_path, scheme, case):
+    """A disk that knows no case loses it: a whole set was not found, and UAVDT's regions were objects of nobody."""
+    root = tmp_path / "set"
+    write = {"visdrone": write_visdrone, "uavdt": write_uavdt, "mot": write_mot}[scheme]
+    write(root / "S1" if scheme == "mot" else root, *(["a"] if scheme == "visdrone" else []))
+    (before,) = open_dataset(f"{scheme}:{root}")
+    truth = [before.labels(index) for index in range(6)]
+    for path in sorted(root.rglob("*"), reverse=True):
+        path.rename(path.with_name(case(path.name)))
+    (after,) = open_dataset(f"{scheme}:{root}")
+    assert (after.name.lower(), after.attributes) == (before.name.lower(), before.attributes)
+    for one, index in zip(truth, range(6), strict=True):
+        now = after.labels(index)
+        assert now.boxes_xyxy_px.tolist() == one.boxes_xyxy_px.tolist()
+        assert now.passed_xyxy_px.tolist() == one.passed_xyxy_px.tolist()
+
+
 def test_uavdt_without_classes_or_regions(tmp_path):
     """The tracking truth alone says where vehicles are, not which."""
     write_uavdt(tmp_path, whole=False)

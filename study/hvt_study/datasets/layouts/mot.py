@@ -35,6 +35,7 @@ from hvt_common.files import read_text
 from hvt_common.inference.labels import read_labels
 from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows, usual_cells
+from hvt_study.datasets.label_files import in_any_case
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options, missing_labels
@@ -153,11 +154,12 @@ def _in_the_world(rows: Rows) -> bool:
 
 
 def _is_sequence(folder: Path) -> bool:
-    return (folder / _INFO).is_file() or (folder / _TRUTH).is_file() or (folder / _PICTURES).is_dir()
+    return any(in_any_case(folder / one).exists() for one in (_INFO, _TRUTH, _PICTURES))
 
 
 def _open(name: str, folder: Path, options: Options) -> Sequence:
-    info = _info(folder / _INFO) if (folder / _INFO).is_file() else None
+    about = in_any_case(folder / _INFO)
+    info = _info(about) if about.is_file() else None
     if info is None and options.fps is None:
         raise UserError(
             f"MOTChallenge sequence {folder} has no {_INFO}, which says the frame rate: "
@@ -165,7 +167,7 @@ def _open(name: str, folder: Path, options: Options) -> Sequence:
         )
     said = info or {}
     images = _images(folder, said)
-    fps = options.fps or _rate(folder / _INFO, said)
+    fps = options.fps or _rate(about, said)
     labels = _labels(folder, said, images) if options.annotated else None
     sequence = images.sequence(name=name, dataset="mot", fps=fps, labels=labels)
     return sequence if labels is None else replace(sequence, one_target=_one_target(labels.table()))
@@ -178,7 +180,7 @@ def _one_target(table: LabelTable) -> bool:
 
 
 def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
-    pictures = folder / info.get("imDir", _PICTURES)
+    pictures = in_any_case(folder / info.get("imDir", _PICTURES))
     if not pictures.is_dir():
         raise UserError(f"MOTChallenge sequence {folder} has no folder {pictures.name} of images")
     images = ImageSequence(pictures)
@@ -198,12 +200,14 @@ def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
 
 
 def _labels(folder: Path, info: Mapping[str, str], images: ImageSequence) -> TableLabels:
-    truth = folder / _TRUTH
+    truth = in_any_case(folder / _TRUTH)
     if not truth.is_file():
         raise missing_labels(f"MOTChallenge sequence {folder}", _TRUTH)
     beside = _BESIDE_ON_MOT20 if info.get("name", folder.name).startswith("MOT20") else _BESIDE
     return TableLabels(
-        mot_table, (truth, folder / "gt" / "labels.txt", images.size, beside), images.first_number
+        mot_table,
+        (truth, in_any_case(truth.with_name("labels.txt")), images.size, beside),
+        images.first_number,
     )
 
 

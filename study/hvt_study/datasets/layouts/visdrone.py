@@ -31,6 +31,7 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.class_map import VEHICLE
+from hvt_study.datasets.label_files import in_any_case
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels, video_table
 from hvt_study.datasets.labels import no_boxes, no_ids
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
@@ -47,18 +48,21 @@ def open_visdrone(root: Path, options: Options) -> Mapping[str, Callable[[], Seq
 
     Raises `UserError` where ROOT is not laid out so, or annotations are missing.
     """
-    splits = [folder for folder in find_folders(root, depth=1) if (folder / "sequences").is_dir()]
+    every = (in_any_case(folder / "sequences") for folder in find_folders(root, depth=1))
+    splits = [folder for folder in every if folder.is_dir()]
     if not splits:
-        hint = ": these are images, use still:" if (root / "images").is_dir() else f": expected is {_LAYOUT}"
+        images = in_any_case(root / "images").is_dir()
+        hint = ": these are images, use still:" if images else f": expected is {_LAYOUT}"
         raise UserError(f"VisDrone folder {root} has no folder sequences{hint}")
     found: dict[str, Callable[[], Sequence]] = {}
-    for split in splits:
-        for folder in find_folders(split / "sequences", depth=1)[1:]:
+    for sequences in splits:
+        split = sequences.parent
+        for folder in find_folders(sequences, depth=1)[1:]:
             name = folder.name if folder.name not in found else f"{split.name}/{folder.name}"
-            annotations = split / "annotations" / f"{folder.name}.txt"
+            annotations = in_any_case(split / "annotations" / f"{folder.name}.txt")
             found[name] = partial(_open, name, folder, annotations, options)
     if not found:
-        raise UserError(f"VisDrone folder {splits[0] / 'sequences'} is empty: expected is {_LAYOUT}")
+        raise UserError(f"VisDrone folder {splits[0]} is empty: expected is {_LAYOUT}")
     return found
 
 
@@ -73,7 +77,7 @@ def _open(name: str, folder: Path, annotations: Path, options: Options) -> Seque
 
 
 _NAMES = ("car", "truck", "bus")
-_SEQUENCE = re.compile(r"M[0-9]{4}")
+_SEQUENCE = re.compile(r"M[0-9]{4}", re.IGNORECASE)
 _DEPTH = 3
 _ATTRIBUTES = (
     *(("weather", word) for word in ("daylight", "night", "fog")),
@@ -95,7 +99,8 @@ def open_uavdt(root: Path, options: Options) -> Mapping[str, Callable[[], Sequen
         raise UserError(
             f"UAVDT folder {root} has no sequences: expected are folders M0203 with img000001.jpg …"
         )
-    texts = {file.name: file for folder in [*folders, root.parent] for file in sorted(folder.glob("*_*.txt"))}
+    places = [*folders, root.parent]
+    texts = {file.name.lower(): file for one in places for file in sorted(one.glob("*_*.[tT][xX][tT]"))}
     ordered = sorted(sequences.items())
     return {name: partial(_open_uavdt, name, folder, texts, options) for name, folder in ordered}
 
@@ -105,7 +110,7 @@ def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
     rows = read_rows(
         whole, columns="frame,id,x,y,w,h,out-of-view,occlusion,category", least=9, of_dataset=True
     )
-    plain = not whole.name.endswith("_gt_whole.txt")
+    plain = not whole.name.lower().endswith("_gt_whole.txt")
     if not plain:
         rows = rows.only(
             np.isin(rows["category"], (1, 2, 3)), accepted="a category of 1 car, 2 truck or 3 bus in column 9"
@@ -126,16 +131,18 @@ def _folders(root: Path) -> list[Path]:
 
 
 def _open_uavdt(name: str, folder: Path, texts: Mapping[str, Path], options: Options) -> Sequence:
-    inside = next((folder / inner for inner in ("img1", "images") if (folder / inner).is_dir()), folder)
+    inner = (in_any_case(folder / one) for one in ("img1", "images"))
+    inside = next((one for one in inner if one.is_dir()), folder)
     images = ImageSequence(inside)
     labels = None
     if options.annotated:
-        whole = texts.get(f"{name}_gt_whole.txt") or texts.get(f"{name}_gt.txt")
+        begin = name.lower()
+        whole = texts.get(f"{begin}_gt_whole.txt") or texts.get(f"{begin}_gt.txt")
         if whole is None:
             raise missing_labels(f"UAVDT sequence {folder}", f"{name}_gt_whole.txt")
-        ignore = texts.get(f"{name}_gt_ignore.txt", whole.with_name(f"{name}_gt_ignore.txt"))
+        ignore = texts.get(f"{begin}_gt_ignore.txt", whole.with_name(f"{name}_gt_ignore.txt"))
         labels = TableLabels(uavdt_table, (whole, ignore, images.size), images.first_number)
-    attributes = _attributes(texts.get(f"{name}_attr.txt"))
+    attributes = _attributes(texts.get(f"{name.lower()}_attr.txt"))
     fps = options.fps or _FPS
     return images.sequence(name=name, dataset="uavdt", fps=fps, labels=labels, attributes=attributes)
 
