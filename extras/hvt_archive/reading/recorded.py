@@ -44,6 +44,7 @@ from hvt_ground.sinks.rerun.map_rows import pose_of
 from hvt_ground.sinks.rerun.readable import has_holes, readable, what_is_read
 from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId
+from hvt_ground.sinks.rerun.stills import refined_by_event
 
 _log = logging.getLogger(__name__)
 
@@ -107,16 +108,15 @@ class _Read(Recorded):
 
     def _is_refined(self, track_id: int, path: str, frame: int) -> bool:
         # Stills may doubt a track, or the ground its whole view: then no still of it was shown.
-        return path == REFINED or (path == DOUBTED and self._read_from.get(track_id, frame + 1) <= frame)
+        return path == REFINED or (path == DOUBTED and self._read_from.get(track_id, frame) < frame)
 
     @cached_property
     def _read_from(self) -> Mapping[int, int]:
-        # By track, the frame of its first still; a caption begins with its track.
+        # By track, the frame of its first still: of every object in each still there is an event.
         first: dict[int, int] = {}
-        for one in self.stills:
-            track = one.caption.partition(" ")[0]
-            if track.isdigit():
-                first.setdefault(int(track), one.frame_index)
+        for one in self.notices:
+            if (track := refined_by_event(one.text)) is not None:
+                first.setdefault(track, one.frame_index)
         return first
 
     def _located(self, overlay: Overlay) -> Overlay:

@@ -24,7 +24,7 @@ Coded = tuple[bytes, tuple[int, int]]
 
 _FIRST_STORED = 2**31
 """Stills that were stored at the edge are numbered from here on."""
-_STILL = re.compile(r"(late )?still #(\d+) ")
+_STILL = re.compile(r"(late )?still #(\d+) (?:→ track (\d+): .*(?:\.\d\d|1\.0)  \()?")
 _QUALITIES_PCT = (75, 65, 55)
 _STILL_QUALITY_PCT = 85
 
@@ -185,6 +185,12 @@ def still_of_event(text: str) -> int | None:
     """The sequence number of the still that `event_text` tells of; None of another event."""
     found = _STILL.match(text)
     return None if found is None else int(found[2]) + (_FIRST_STORED if found[1] else 0)
+
+
+def refined_by_event(text: str) -> int | None:
+    """The ground's track whose class the still of this event told; None where it told none's."""
+    found = _STILL.match(text)
+    return None if found is None or found[3] is None else int(found[3])
 
 
 def still_picture(refinement: Refinement) -> Coded | None:

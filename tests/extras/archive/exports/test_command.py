@@ -147,6 +147,22 @@ def test_boxes_are_drawn_in_on_request(recording, events, tmp_path):
     assert changed.mean() < 0.25
 
 
+def test_a_track_that_stills_doubt_stays_refined(events, tmp_path):
+    """The recording has no layer for it: of a still's second object, and without its picture, that was lost."""
+    still = replace(next(one for one in events if isinstance(one, Refinement)), frame_index=0)
+    stills = [
+        replace(still, still_sequence=1, track_id=1),
+        replace(still, still_sequence=1, track_id=2, doubted=True, class_after="other"),
+        replace(still, still_sequence=2, track_id=3, still=b"", still_bgr=None),
+        replace(still, still_sequence=3, track_id=4, unread=True),
+        replace(still, still_sequence=4, track_id=None),
+    ]
+    boxes = np.tile(np.float32((9, 9, 40, 40)), (5, 1))
+    doubted = examples.overlay(1, boxes, capture_ns=START_NS + STEP_NS, doubted=np.ones(5, np.bool_))
+    out = export(recorded(tmp_path / "doubted.rrd", [events[0], *stills, doubted]), tmp_path / "t.csv")
+    assert [row["refined"] for row in lines(out)] == ["1", "1", "1", "0", "0"]
+
+
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")  # of what motmetrics uses
 def test_the_tracks_are_those_that_the_ground_had(recording, events, tmp_path):
     """A table that another program reads would be wrong, by more than the recording is coarse."""
