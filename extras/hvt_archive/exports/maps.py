@@ -141,8 +141,10 @@ def write_kml(recorded: Recorded, path: Path) -> None:
             _timed_way(shapes, track.spots)
         else:
             _with(_with(shapes, "Point"), coordinates=f"{spot.longitude_deg:.7f},{spot.latitude_deg:.7f}")
-        ring = _with(_with(_with(shapes, "Polygon"), "outerBoundaryIs"), "LinearRing")
-        _with(ring, coordinates=" ".join(f"{east:.7f},{north:.7f}" for north, east in _outline(spot)))
+        outline = _outline(spot)
+        if all(abs(east - spot.longitude_deg) < 180 for _, east in outline):  # else drawn around the earth
+            ring = _with(_with(_with(shapes, "Polygon"), "outerBoundaryIs"), "LinearRing")
+            _with(ring, coordinates=" ".join(f"{east:.7f},{north:.7f}" for north, east in outline))
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 

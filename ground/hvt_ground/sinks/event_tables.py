@@ -43,8 +43,8 @@ STILL_COLUMNS = (
 """``frame_index`` is the still's frame, ``known_frame_index`` the one at which it was known, both from 0; ``x y w h``
 is where the whole picture lies in the base picture of ``frame_index``, base pixels."""
 
-_FORMULA = re.compile(r"[=@]|[+-](?!\d+(\.\d+)?$)")
-"""The beginning of a text that a spreadsheet computes."""
+_FORMULA = re.compile(r"\s*([=@\uff1d\uff20]|[+\uff0b\uff0d-](?!\d+(\.\d+)?$))")
+"""The beginning of a text that a spreadsheet computes; Asian ones take wide signs as well (OWASP, CSV injection)."""
 
 
 def plain_cells(row: Iterable[object]) -> tuple[object, ...]:

@@ -110,7 +110,13 @@ def test_each_line_says_who_knows_of_the_track(tmp_path, origins, expected):
 
 @pytest.mark.parametrize(
     ("name", "cell"),
-    [('=HYPERLINK("x")', '\'=HYPERLINK("x")'), ("@SUM(1)", "'@SUM(1)"), ("-1+1", "'-1+1"), ("+-x", "'+-x")],
+    [
+        ('=HYPERLINK("x")', '\'=HYPERLINK("x")'),
+        ("@SUM(1)", "'@SUM(1)"),
+        ("-1+1", "'-1+1"),
+        ("+-x", "'+-x"),
+        (" \uff1d1+1", "' \uff1d1+1"),
+    ],
 )
 def test_a_class_that_a_spreadsheet_would_compute_is_text(tmp_path, name, cell):
     """Names come from the wire: who opens the table would run what somebody on the link wrote."""

@@ -173,6 +173,10 @@ def test_what_stands_still_at_the_antimeridian_did_not_move(hovering, tmp_path):
     ]
     assert {one["geometry"]["type"] for one in tracks} == {"Point"}
     assert {one["geometry"]["coordinates"][0] > 0 for one in tracks} == {True, False}
+    rings = ET.parse(export(hovering, tmp_path / "m.kml")).findall(f".//{KML}LinearRing/{KML}coordinates")
+    sides = [{place[0] == "-" for place in (one.text or "").split()} for one in rings]
+    assert sides, "none has an outline"
+    assert all(len(one) == 1 for one in sides), "one across it, which is drawn around the earth"
 
 
 def test_ways_over_the_antimeridian_are_in_parts(crossing, tmp_path):
