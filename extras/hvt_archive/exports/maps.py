@@ -62,7 +62,9 @@ class _Track:
     classes: Counter[str] = field(default_factory=Counter)
     confidence: float = 0.0
     refined: bool = False
+    first_ns: int = 2**63
     last_ns: int = 0
+    """The earliest and the latest time, by a clock that may have been set back."""
 
     @property
     def class_name(self) -> str:
@@ -102,7 +104,7 @@ def write_geojson(recorded: Recorded, path: Path) -> None:
             "class": track.class_name,
             "confidence": round(track.confidence, 3),
             "refined": track.refined,
-            "first_utc": utc_text(track.spots[0].capture_ns),
+            "first_utc": utc_text(track.first_ns),
             "last_utc": utc_text(track.last_ns),
             "error_m": round(spot.ellipse[0], 1),
             "error_minor_m": round(spot.ellipse[1], 1),
@@ -122,8 +124,7 @@ def write_kml(recorded: Recorded, path: Path) -> None:
         spot = track.surest
         place = _with(document, "Placemark", name=f"{track_id} {track.class_name}")
         if not track.moved:  # a way has times of its own
-            first_ns = track.spots[0].capture_ns
-            _with(place, "TimeSpan", begin=utc_text(first_ns), end=utc_text(track.last_ns))
+            _with(place, "TimeSpan", begin=utc_text(track.first_ns), end=utc_text(track.last_ns))
         red, green, blue = class_colour(track.class_name)
         style = _with(place, "Style")
         for kind in ("IconStyle", "LineStyle"):  # in the order of the schema
@@ -172,12 +173,11 @@ def _tracks(recorded: Recorded) -> dict[int, _Track]:
             track.classes[overlay.words[row]] += 1
             track.confidence = max(track.confidence, float(overlay.confidences[row]))
             track.refined |= bool(overlay.refined[row])
-            track.last_ns = overlay.capture_ns
-            if not track.spots or overlay.capture_ns - track.spots[-1].capture_ns >= _EVERY_NS:
+            at_ns = overlay.capture_ns
+            track.first_ns, track.last_ns = min(track.first_ns, at_ns), max(track.last_ns, at_ns)
+            if not track.spots or abs(at_ns - track.spots[-1].capture_ns) >= _EVERY_NS:
                 major, minor, azimuth = places.ellipses[row].tolist()
-                track.spots.append(
-                    _Spot(overlay.capture_ns, longitude, latitude, ellipse=(major, minor, azimuth))
-                )
+                track.spots.append(_Spot(at_ns, longitude, latitude, ellipse=(major, minor, azimuth)))
     return dict(sorted(tracks.items()))
 
 

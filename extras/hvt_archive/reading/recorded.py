@@ -398,7 +398,7 @@ def _poses(rows: _Rows) -> list[PoseUpdate]:
         pose_of(numbers, frame_index=frame, capture_ns=capture_ns)
         for frame, capture_ns, numbers in rows.get((MAP_CAMERA, _POSE), [])
     ]
-    return sorted(found, key=lambda one: one.capture_ns)
+    return sorted(found, key=lambda one: (one.frame_index, one.capture_ns))
 
 
 def _notices(rows: _Rows) -> list[Notice]:

@@ -122,13 +122,14 @@ class Recorded(ABC):
     stills: Sequence[RecordedStill]
     notices: Sequence[Notice]
     poses: Sequence[PoseUpdate]
+    """In order of frames."""
     locator: Locator
     """Gives its tracks places on the map."""
 
     @cached_property
     def trail(self) -> PoseTrail:
         trail = PoseTrail(most=len(self.poses))
-        for one in self.poses:
+        for one in sorted(self.poses, key=lambda one: one.capture_ns):  # a clock may have been set back
             trail.add(one.pose)
         return trail
 

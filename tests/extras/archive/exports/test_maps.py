@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -19,14 +20,16 @@ from rasterio.transform import from_origin
 
 import hvt_ground.cli
 from hvt_common.geodesy import metres_per_degree
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
 from hvt_gateways.mcap.file import _location
 from hvt_geo.camera import places_of_boxes
-from hvt_ground.events import Overlay, PoseUpdate
+from hvt_ground.events import Overlay, PoseUpdate, VideoSample
 from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs import rrd
 from programs.rrd import Recording
+from rigs import examples
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Use `@` matmul:PendingDeprecationWarning"
@@ -196,6 +199,25 @@ def test_ways_over_the_antimeridian_are_in_parts(crossing, tmp_path):
         parts = one["geometry"]["coordinates"]
         for part in parts if one["geometry"]["type"] == "MultiLineString" else [parts]:
             assert np.ptp(np.array(part)[:, 0]) < 1
+
+
+@pytest.mark.parametrize("set_back_s", [30, 3600])
+def test_a_clock_that_was_set_back_breaks_no_way(tmp_path, set_back_s):
+    """The camera's way led back from its end to its beginning, and the tracks' ways ended there."""
+    path = tmp_path / "flight.rrd"
+    with Recorder(rrd.settings(path)) as recorder:
+        for frame, (unit, _) in enumerate(coded(drawn_frames(FRAMES, SIZE), kbps=100, keyint=FRAMES)):
+            capture_ns = START_NS + frame * STEP_NS - (frame >= 30) * set_back_s * SECOND_NS
+            pose = replace(pose_at(frame), capture_ns=capture_ns)
+            if frame % 15 == 0:
+                recorder.log(PoseUpdate(frame, capture_ns, pose, VIEW))
+            recorder.log(VideoSample(frame, capture_ns, unit, keyframe=frame == 0))
+            recorder.log(examples.overlay(frame, [9 + frame, 9, 50 + frame, 60], capture_ns=capture_ns))
+    camera, track = json.loads(export(path, tmp_path / "m.geojson").read_text(encoding="utf-8"))["features"]
+    for one in (camera, track):
+        way = [place[0] for place in one["geometry"]["coordinates"]]
+        assert (len(way), way) == (4, sorted(way))
+    assert track["properties"]["first_utc"] < track["properties"]["last_utc"]
 
 
 def test_an_export_with_the_wrong_terrain_says_so(recording, tmp_path, caplog):
