@@ -121,6 +121,6 @@ def _items(data: bytes) -> dict[int, bytes]:
 @pytest.mark.parametrize("kind", _documented())
 def test_an_export_has_the_units_of_the_table(kind, tmp_path, monkeypatch):
     """Two files of one flight would number its frames apart, or call 88 what the other calls .876."""
-    picture = np.zeros((36, 64, 3), np.uint8)
+    picture = np.zeros((72, 128, 3), np.uint8)
     monkeypatch.setattr(pictures, "pictures", lambda one: [(one.video[0], picture, OVERLAY)])
     assert globals()[f"_{kind}"](tmp_path / f"flight.{kind}") == _documented()[kind]
