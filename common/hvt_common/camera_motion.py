@@ -36,18 +36,20 @@ class SceneChange:
     """
 
     def __init__(self) -> None:
-        self._before: _Thumbnail | None = None
+        self._before: tuple[_Thumbnail, np.float32] | None = None
+        """The last picture less its mean, and that."""
         self._usual: deque[float] = deque(maxlen=_NEWEST)
         """Differences of two pictures lately, levels."""
 
     def take(self, image: Image) -> bool:
         """Whether this picture, BGR or gray, has nothing to do with the one just before."""
         small = _thumbnail(image)
-        before, self._before = self._before, small
+        level = small.mean()
+        here, before = small - level, self._before
+        self._before = here, level
         if before is None:
             return False
-        brighter = float(small.mean() - before.mean())
-        here, there = small - small.mean(), before - before.mean()
+        there, brighter = before[0], float(level - before[1])
         difference = float(np.abs(here - there).mean()) + max(0.0, abs(brighter) - _EXPOSURE)
         usual = max(self._usual, default=None)
         self._usual.append(difference)

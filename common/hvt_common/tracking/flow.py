@@ -90,7 +90,8 @@ def _of_large(
     shape = (len(boxes), _POINTS)
     good = (status.reshape(shape) == 1) & (changed.reshape(shape) < _MOST_CHANGED)
     shifts = (moved + origin - first).reshape(*shape, 2).astype(np.float64)
-    apart = np.abs(shifts - np.median(shifts, axis=1, keepdims=True)).max(axis=2)
+    median = np.partition(shifts, _POINTS // 2, axis=1)[:, _POINTS // 2, None]
+    apart = np.abs(shifts - median).max(axis=2)
     good &= apart < np.maximum(_MOST_APART_PX, _MOST_APART * sides.min(axis=2))
     weights = good[:, :, None] / np.maximum(1, good.sum(axis=1))[:, None, None]
     middle, shift = (weights * points).sum(axis=1), (weights * shifts).sum(axis=1)

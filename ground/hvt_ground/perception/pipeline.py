@@ -443,7 +443,8 @@ class Pipeline:
         # The tracker lets boxes leave the picture.
         boxes = np.clip(shown.boxes_base_px, 0, np.array([*self._base_size, *self._base_size], np.float32))
         rows = np.flatnonzero(areas(boxes) > _LEAST_INSIDE * areas(shown.boxes_base_px))
-        return replace(shown, boxes_base_px=boxes).take(rows)
+        shown = replace(shown, boxes_base_px=boxes)
+        return shown if len(rows) == len(boxes) else shown.take(rows)
 
     def _carry_merges(self) -> None:
         for survivor_id, merged_id in self._parts.fusion.take_merged():
