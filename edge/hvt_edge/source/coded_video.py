@@ -47,11 +47,9 @@ class CodedVideoSource(ClipSource):
         container, stream = open_video(spec, growing=self._growing, note=notes)
         with container:
             check_stream(self._name, stream)
-            self._stamps, first = survey(container, stream)
+            self._stamps, first = survey(container, stream, name=self._name)
             if settings.source_fps is not None:
                 self._stamps = Stamps(1 / exact_rate(settings.source_fps), usable=False)
-        if first is None:
-            raise UserError(f"source {self._name!r} holds a video stream of which no frame can be decoded")
         self.warning = check_picture(self._name, first, size=settings.size)
         self._size = (first.width, first.height)
         self._resizer = Resizer(self._size, settings.size, fit=settings.fit)

@@ -11,7 +11,6 @@ from typing import Any
 
 import av
 
-from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Frame
 from hvt_edge.source.contract import ClipSource, Notes, SourceSettings
@@ -39,17 +38,13 @@ class VideoSource(ClipSource):
         self._pictures = Pictures(notes)
         container, stream = open_video(spec, growing=self._growing, note=notes)
         with container:
-            self._stamps, first = survey(container, stream)
+            self._stamps, first = survey(container, stream, name=self._name)
             if self._override is not None:
                 self._stamps = Stamps(1 / self._override, usable=False)
             lasts_s = self._duration_s(stream)
             self._pictures.begin(stream)
-            shown = None if first is None else next(iter(self._shown([(Fraction(0), first)])), None)
-            if shown is None:
-                raise UserError(
-                    f"source {self._name!r} holds a video stream of which no frame can be decoded"
-                )
-            picture = self._pictures.bgr(shown[1])
+            _, shown = next(self._shown([(Fraction(0), first)]))
+            picture = self._pictures.bgr(shown)
             if self._override is None:
                 notes(about_times(stream, self._stamps))
         self.notes = notes.taken()

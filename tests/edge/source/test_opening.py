@@ -484,6 +484,14 @@ def test_a_recording_that_a_server_sends_as_a_whole_is_a_clip(tmp_path, http_str
         assert len(list(source.frames(start_ns=0))) == 200
 
 
+def test_an_mp4_whose_index_cannot_be_reached_says_how_it_can(tmp_path, http_stream):
+    """Of a whole file it was said that no frame can be decoded; its server sends no ranges."""
+    clip = write_clip(tmp_path / "a.mp4", codec="mjpeg", pixels="yuvj420p", count=60, size=(320, 240))
+    Live.stream = Path(clip).read_bytes()
+    said = refused(http_stream.replace("live", "whole"))
+    assert "without HTTP ranges plays an MP4 whose index (moov) comes first (+faststart)" in said
+
+
 @pytest.mark.parametrize("step_s", [-3600, 3600])
 def test_a_clock_that_is_set_neither_stops_a_camera_nor_dates_it_anew(http_stream, monkeypatch, step_s):
     """NTP would silence the camera for as long as the clock was ahead, or put an hour into the recording."""

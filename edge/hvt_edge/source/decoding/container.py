@@ -209,19 +209,28 @@ def duration_s(stream: Any) -> Fraction | None:
     return whole_s - begin_s if 0 < begin_s < whole_s else whole_s
 
 
-def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
-    """The times in the stream's first packets, and its first frame; None if none decodes there."""
+def survey(container: Any, stream: Any, *, name: str) -> tuple[Stamps, av.VideoFrame]:
+    """The times in the stream's first packets, and its first frame. Raises `UserError` where none decodes there."""
     times: list[tuple[Fraction | None, Fraction | None]] = []
     first: av.VideoFrame | None = None
+    why = ""
     for packet in packets_of(container, stream):
         if first is None:
             with suppress(av.error.FFmpegError):
                 first = next(iter(decode(stream, packet)), None)
-        if not isinstance(packet, Exception) and packet.size:
+        if isinstance(packet, Exception):
+            why = f" ({cause_of(packet)})"
+            if "://" in name and "mp4" in container.format.name:
+                why += (
+                    ": a server without HTTP ranges plays an MP4 whose index (moov) comes first (+faststart)"
+                )
+        elif packet.size:
             base = packet.time_base
             times.append((_seconds(packet.pts, base), _seconds(packet.dts, base)))
         if len(times) >= _SURVEYED and first is not None:
             break
+    if first is None:
+        raise UserError(f"source {name!r} holds a video stream of which no frame can be decoded{why}")
     rate = said_rate(stream)
     if without_stamps(stream):
         return Stamps(1 / (rate or Fraction(25)), usable=False), first
