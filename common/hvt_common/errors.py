@@ -31,6 +31,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NO_MORE = (errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _NO_MORE_WORDS = ("can't start new thread", "failed to map segment from shared object")
 """Words of Python's errors without a number."""
+_ENDLESS = re.compile(r"(\S{300})\S+")
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
 
 
@@ -222,7 +223,7 @@ def exit_with_sentence(
         print(end="", flush=True)
     except (UserError, FlightError) as error:
         if not error.said:
-            print(f"{program}: {redaction.text(str(error))}", file=sys.stderr)
+            print(f"{program}: {_in_a_line(redaction.text(str(error)))}", file=sys.stderr)
         return 2 if isinstance(error, UserError) and not isinstance(error, NotYetError) else 1
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
@@ -240,6 +241,12 @@ def exit_with_sentence(
         print(f"{program}: {sentence}", file=sys.stderr)
         return 1
     return code
+
+
+def _in_a_line(sentence: str) -> str:
+    # A value may have line ends, and no end.
+    shown = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in sentence)
+    return _ENDLESS.sub(r"\1…", shown)
 
 
 def _used_up(error: Exception) -> str:

@@ -207,6 +207,17 @@ def test_where_the_system_gives_no_more_that_is_a_sentence(error, capsys):
     assert said.startswith("it: the system gives it no more memory, threads or files (")
 
 
+def test_a_value_with_line_ends_or_without_an_end_is_told_in_a_line(capsys):
+    """A log would have half of the sentence, or a screen of nines."""
+
+    def refuse(_argv):
+        raise UserError(f"--size {'9' * 5000!r} and a\nb\udcff are not accepted: give é")
+
+    assert exit_with_sentence(refuse, program="it", argv=[]) == 2
+    told = capsys.readouterr().err
+    assert told == f"it: --size {repr('9' * 5000)[:300]}… and a\\nb\\udcff are not accepted: give é\n"
+
+
 def test_an_interruption_is_a_sentence(capsys):
     """Ctrl-C while a ground starts, or in the middle of an export, showed forty lines of a traceback."""
 
