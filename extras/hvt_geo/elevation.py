@@ -45,6 +45,8 @@ _ALONG: Final = 11
 """Points on a side by which an area is found in a file."""
 _EDGE: Final = 2
 """Cells around it, between which elevation is."""
+_LOWEST_M, _HIGHEST_M = -1000.0, 9000.0
+"""No ground is beyond: models mark holes with -32768, -9999 and others, and do not always say so."""
 
 
 class ModelError(Exception):
@@ -205,9 +207,11 @@ def _read(file: Any, area: _Area, shape: tuple[int, int]) -> npt.NDArray[np.floa
         return found
     rows, columns = min(_MOST_SIDE, window.height), min(_MOST_SIDE, window.width)
     there = file.read(1, window=window, out_shape=(rows, columns), masked=True)
+    metres = there.astype(np.float64).filled(np.nan) * file.scales[0] + file.offsets[0]
+    metres[(metres < _LOWEST_M) | (metres > _HIGHEST_M)] = np.nan
     thinned = Affine.scale(window.width / columns, window.height / rows)
     reproject(
-        np.asarray(there.astype(np.float64).filled(np.nan), np.float32),
+        np.asarray(metres, np.float32),
         found,
         src_crs=file.crs,
         src_transform=file.window_transform(window) * thinned,
