@@ -175,4 +175,4 @@ def sure_and_right(
 
 
 def _number(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, 4)
+    return None if math.isnan(value) else round(value, 6)

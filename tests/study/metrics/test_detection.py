@@ -10,8 +10,10 @@ import pytest
 
 from hvt_common.inference.class_names import kind_of
 from hvt_common.values import iou
+from hvt_study.commands.output import decimals
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.judged import FrameView, judged
+from hvt_study.metrics.picture_score import picture_score
 from studies.metric_frames import labels, square, view
 
 
@@ -118,6 +120,13 @@ def test_crowded_frames_count_whole():
     boxes = [square(20 * column, 20 * row) for row in range(10) for column in range(15)]
     frame_index = labels(*((box, "car") for box in boxes)), view(*((box, "car") for box in boxes))
     assert detection_score(judged([frame_index])).mean.at_50 == pytest.approx(1.0)
+
+
+def test_a_share_is_rounded_once():
+    """177 right of 220 are .80454: a table had .804."""
+    boxes = [(square(20 * number), "car") for number in range(220)]
+    frames = judged([(labels(*boxes[:177]), view(*boxes))])
+    assert decimals(picture_score(frames, detection_score(frames))["precision"]) == "0.805"
 
 
 def test_nothing():
