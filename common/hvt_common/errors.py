@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import re
 import select
+import signal
 import socket
 import sys
 import traceback
@@ -26,7 +28,6 @@ _MAY_COME = frozenset(
         *(errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM),
     }
 )
-_INTERRUPTED = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NO_MORE = (errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _NO_MORE_WORDS = ("can't start new thread", "failed to map segment from shared object")
@@ -207,13 +208,14 @@ def exit_with_sentence(
 ) -> int:
     """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError` or a `NotYetError`, said.
 
-    130, as of a shell, where the user has interrupted it. Neither that nor a traceback has the secrets of an address
-    in ``argv``; a word that ``local`` matches whole is none.
+    128 and the signal's number, as of a shell, where one has interrupted it (130: Ctrl-C). Neither that nor a
+    traceback has the secrets of an address in ``argv``; a word that ``local`` matches whole is none.
 
     Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word; a full disk,
     or no memory, with 1. Standard streams that were closed are /dev/null.
     """
     _open_standard_streams()
+    _print_any_character()
     words = sys.argv[1:] if argv is None else argv
     redaction = Redaction(one for one in words if local is None or not local.fullmatch(one))
     sys.excepthook = _traceback_without(redaction)
@@ -225,9 +227,9 @@ def exit_with_sentence(
         if not error.said:
             print(f"{program}: {_in_a_line(redaction.text(str(error)))}", file=sys.stderr)
         return 2 if isinstance(error, UserError) and not isinstance(error, NotYetError) else 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print(f"{program}: interrupted", file=sys.stderr)
-        return _INTERRUPTED
+        return 128 + next((one for one in error.args if isinstance(one, int)), signal.SIGINT)
     except BrokenPipeError:
         if not _reader_left():
             raise
@@ -276,6 +278,15 @@ def _open_standard_streams() -> None:
             os.set_inheritable(number, True)
             if getattr(sys, name) is None:
                 setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115
+
+
+def _print_any_character() -> None:
+    # An ellipsis in a help text is no bug where the locale has none; in that of C Python takes UTF-8 (PEP 540).
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors == "surrogateescape":
+            stream.reconfigure(encoding="utf-8", errors="surrogateescape")
 
 
 def _check_folder() -> None:

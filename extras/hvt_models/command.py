@@ -21,6 +21,7 @@ from hvt_common.inference.store import (
     embedded_models,
     resolve_model,
 )
+from hvt_common.runtime.process import interrupt_on_signals
 from hvt_models.manifest import ModelEntry
 from hvt_models.store import Store, file_digest
 
@@ -34,6 +35,7 @@ _EMBEDDED = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``hvt-models``; 0, or 2 after one sentence on stderr where the user can mend something."""
+    interrupt_on_signals()
     return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
 
 

@@ -14,6 +14,7 @@ from hvt_common.runtime.log import start_log
 from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.process import (
     ended_in_time,
+    interrupt_on_signals,
     leave,
     limit_malloc_arenas,
     put_video_first,
@@ -49,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def program() -> NoReturn:
     """`main` as a process of its own."""
+    interrupt_on_signals()
     leave(main())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -159,6 +160,23 @@ def test_streams_that_were_closed_take_no_files(tmp_path):
     assert (tmp_path / "recording").read_bytes() == b""
 
 
+@pytest.mark.parametrize(
+    ("locale", "shown"),
+    [
+        ({"PYTHONIOENCODING": "latin-1"}, b"\xfc?\n"),
+        ({"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, "ü…\n".encode()),
+    ],
+)
+def test_a_locale_without_utf_8_ends_nothing(locale, shown):
+    """`hvt-edge --help` was a traceback there, for it has an ellipsis."""
+    print_it = r"print('\xfc\u2026')"
+    begin = "from hvt_common.errors import exit_with_sentence as run"
+    program = f"{begin}; run(lambda _: {print_it}, program='', argv=[])"
+    environment = {"PATH": os.environ["PATH"], **locale}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, check=False)
+    assert (done.stdout, done.stderr) == (shown, b"")
+
+
 _PARENT = """
 import subprocess, sys
 from hvt_common.errors import exit_with_sentence
@@ -218,11 +236,12 @@ def test_a_value_with_line_ends_or_without_an_end_is_told_in_a_line(capsys):
     assert told == f"it: --size {repr('9' * 5000)[:300]}… and a\\nb\\udcff are not accepted: give é\n"
 
 
-def test_an_interruption_is_a_sentence(capsys):
+@pytest.mark.parametrize(("said", "code"), [((), 130), ((signal.SIGTERM,), 143)])
+def test_an_interruption_is_a_sentence(said, code, capsys):
     """Ctrl-C while a ground starts, or in the middle of an export, showed forty lines of a traceback."""
 
     def run(_argv):
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(*said)
 
-    assert exit_with_sentence(run, program="it", argv=[]) == 130
+    assert exit_with_sentence(run, program="it", argv=[]) == code
     assert capsys.readouterr().err == "it: interrupted\n"

@@ -87,9 +87,13 @@ def ended_in_time(run: Callable[[], T], stop: threading.Event, *, otherwise: Cal
 
 def interrupt_on_signals() -> None:
     """Have SIGTERM and SIGHUP end a command as Ctrl-C does: it says so, and leaves nothing half done behind."""
+
+    def interrupt(number: int, _frame: object) -> None:
+        raise KeyboardInterrupt(number)
+
     for one in STOP_SIGNALS:
         if signal.getsignal(one) is signal.SIG_DFL:  # ``nohup`` has SIGHUP ignored
-            signal.signal(one, signal.default_int_handler)
+            signal.signal(one, interrupt)
 
 
 def notify_systemd(state: str) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from hvt_archive.index.database import read_index
 from hvt_common.errors import Parser
-from hvt_common.runtime.reporting import say
 from hvt_common.units import SECOND_NS, parse_age_s, shown_text, utc_text
 from hvt_ground.recordings.row import RecordingRow
 
@@ -25,7 +24,7 @@ def run(argv: Sequence[str]) -> int:
     wanted = _wanted(arguments) if arguments.command == "find" else lambda _: True
     rows = [row for row in read_index(arguments.folder) if wanted(row)]
     if arguments.json:
-        say(json.dumps([_as_json(row, arguments.folder) for row in rows], indent=2))
+        print(json.dumps([_as_json(row, arguments.folder) for row in rows], indent=2))
         return 0
     table = [_HEAD, *map(_cells, rows)]
     widths = [max(len(line[column]) for line in table) for column in range(len(_HEAD))]
@@ -33,7 +32,7 @@ def run(argv: Sequence[str]) -> int:
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
         for line in table
     )
-    say("\n".join(lines))
+    print(shown_text("\n".join(lines)))
     return 0
 
 
