@@ -207,7 +207,7 @@ def _read(file: Any, area: _Area, shape: tuple[int, int]) -> npt.NDArray[np.floa
         return found
     rows, columns = min(_MOST_SIDE, window.height), min(_MOST_SIDE, window.width)
     there = file.read(1, window=window, out_shape=(rows, columns), masked=True)
-    metres = there.astype(np.float64).filled(np.nan) * file.scales[0] + file.offsets[0]
+    metres = there.astype(np.float64).filled(np.nan)
     metres[(metres < _LOWEST_M) | (metres > _HIGHEST_M)] = np.nan
     thinned = Affine.scale(window.width / columns, window.height / rows)
     reproject(

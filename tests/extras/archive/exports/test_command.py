@@ -157,7 +157,7 @@ def test_a_track_that_stills_doubt_stays_refined(events, tmp_path):
         replace(still, still_sequence=3, track_id=4, unread=True),
         replace(still, still_sequence=4, track_id=None),
     ]
-    boxes = np.tile(np.float32((9, 9, 40, 40)), (5, 1))
+    boxes = np.tile(np.array((9, 9, 40, 40), np.float32), (5, 1))
     doubted = examples.overlay(1, boxes, capture_ns=START_NS + STEP_NS, doubted=np.ones(5, np.bool_))
     out = export(recorded(tmp_path / "doubted.rrd", [events[0], *stills, doubted]), tmp_path / "t.csv")
     assert [row["refined"] for row in lines(out)] == ["1", "1", "1", "0", "0"]
