@@ -20,11 +20,14 @@ from hvt_common.values import Detections
 _log = logging.getLogger(__name__)
 _RUNS = 45
 """Detections on pictures: 15 s at the defaults (15 fps, every fifth frame)."""
-_LEAST_BOXES, _LEAST_PICTURES = 45, 10
+_ENOUGH_BOXES, _ENOUGH_PICTURES = 45, 10
 """The newest pictures with 45 boxes together decide, 10 at least: older ones may be of another scene."""
-_UNLIKE_BELOW = 0.47
+_LEAST_PICTURES = 5
+"""The first of a flight are coded coarsely, and their boxes weak."""
+_BEFORE = 0.6
+"""As if each picture had one more box of this confidence: few boxes must be weaker to tell of an unknown view."""
+_UNLIKE_BELOW, _LIKE_FROM = 0.48, 0.49
 """Vehicles of 40 pixels aslant, of which it finds none, have .37; views that it knows .5 to .8."""
-_LIKE_FROM = 0.5
 
 
 def trust_from(detector: str) -> float | None:
@@ -35,8 +38,11 @@ def trust_from(detector: str) -> float | None:
 class ViewTrust:
     """Trust in the detector on one video. Boxes count from a confidence of ``counts_from``; None trusts every view.
 
-    ``unlike`` holds while the detector does not know the view; that is said once, with the consequence ``hence``.
-    ``mean`` is the mean confidence of the boxes that count, None before there were enough. From any thread.
+    A picture tells of the view if it shows an object: a box of twice that confidence. A faint spot tells nothing.
+
+    ``unlike`` holds while the detector does not know the view; that is said once, with the consequence ``hence``, if
+    ten pictures tell it. ``mean`` is the mean confidence of the boxes that count, with those of `_BEFORE`; None
+    before the fifth picture. From any thread.
     """
 
     def __init__(self, counts_from: float | None, *, hence: str) -> None:
@@ -53,18 +59,20 @@ class ViewTrust:
         if self._counts_from is None:
             return
         counted = found.confidences[found.confidences >= self._counts_from]
+        if not (counted >= 2 * self._counts_from).any():
+            return
         with self._lock:
             self._recent.append((float(np.sum(counted, dtype=np.float64)), len(counted)))
             total, boxes = 0.0, 0
             for pictures, (of_one, count) in enumerate(reversed(self._recent), start=1):
                 total, boxes = total + of_one, boxes + count
-                if pictures >= _LEAST_PICTURES and boxes >= _LEAST_BOXES:
+                if pictures >= _ENOUGH_PICTURES and boxes >= _ENOUGH_BOXES:
                     break
-            else:
-                return  # too few tell nothing new
-            self.mean = total / boxes
+            if pictures < _LEAST_PICTURES:
+                return
+            self.mean = (total + _BEFORE * pictures) / (boxes + pictures)
             self.unlike = self.mean < (_LIKE_FROM if self.unlike else _UNLIKE_BELOW)
-            if not self.unlike or self._said:
+            if not self.unlike or self._said or pictures < _ENOUGH_PICTURES:
                 return
             self._said = True
         _log.warning(
@@ -72,6 +80,6 @@ class ViewTrust:
             "views try hvt-models fetch yolox-s and --detector yolox-s, or teach it yours: hvt-study train",
             EMBEDDED_DETECTOR,
             boxes,
-            self.mean,
+            total / boxes,
             self._hence,
         )

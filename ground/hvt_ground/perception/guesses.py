@@ -102,11 +102,14 @@ class Guesses:
         """(N,) True for those that were guesses in the newest list."""
         return np.array([one in self._ids for one in ids.tolist()], np.bool_)
 
-    def doubting(self, still: Refinement) -> Refinement:
-        """The reading of a still, doubted where it is not sure and its track is a guess, or it has none."""
+    def doubting(self, still: Refinement, *, unlike: bool) -> Refinement:
+        """The reading of a still, doubted where it is not sure and has no track or that of a guess.
+
+        All are guesses where the view is ``unlike`` what the detector knows.
+        """
         if still.unread or are_firm([still.box_base_px], [still.confidence], scale=self._scale)[0]:
             return still
-        guess = still.track_id is None or bool(self.among(np.array([still.track_id]))[0])
+        guess = unlike or still.track_id is None or bool(self.among(np.array([still.track_id]))[0])
         return replace(still, doubted=still.doubted or guess)
 
     def agreed(

@@ -89,6 +89,8 @@ class PipelineParts:
     """Sessions that share the detector share it."""
     trust: ViewTrust
     """How far the detector can be trusted in this session's video."""
+    edge_alike: bool = False
+    """The edge's detector has our classes: it is taken for the same, which knows no view that ours does not."""
     guesses: Guesses | None = None
     """None where the detector's scores are no probabilities."""
     search: ScaleSearch | None = None
@@ -422,20 +424,21 @@ class Pipeline:
         while pending:
             event = pending.pop(0)
             if guesses is not None and isinstance(event, Refinement):
-                event = guesses.doubting(event)
+                event = guesses.doubting(event, unlike=self.trust.unlike)
             self._emit(event)
 
     def _doubting(self, shown: Overlay) -> Overlay:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. Tracks
-        # that only the edge sees are not touched.
+        # that the edge sees with another detector are not touched.
         guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
         doubted = shown.doubted
+        firm = shown.refined & are_firm(shown.boxes_base_px, shown.confidences, scale=self._scale)
         if guesses is not None:
-            firm = shown.refined & are_firm(shown.boxes_base_px, shown.confidences, scale=self._scale)
             doubted = doubted | guesses.among(shown.track_ids) & ~firm
             vague = vague & ~guesses.agreed(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
         if self.trust.unlike:
-            doubted = doubted | np.array([one == "base" for one in shown.origins], np.bool_) & ~shown.refined
+            ours = [self._parts.edge_alike or one == "base" for one in shown.origins]
+            doubted = doubted | np.array(ours, np.bool_) & ~firm
             sure = np.zeros_like(sure)
         return replace(shown, doubted=doubted, sure=sure, vague=vague)
 

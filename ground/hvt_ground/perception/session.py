@@ -75,6 +75,7 @@ class SessionPerception:
             path=path,
             detector_thread=models.detector_thread,
             trust=self._trust,
+            edge_alike=info.class_names == detector.class_names,
             guesses=self._guesses(),
             search=self._scale_search(detector),
             turns=Turns(f"perception of {info.edge}", models.failures),
@@ -143,7 +144,7 @@ class SessionPerception:
 
         def doubting(event: Event) -> None:
             if guesses is not None and isinstance(event, Refinement):
-                event = guesses.doubting(event)
+                event = guesses.doubting(event, unlike=self._trust.unlike)
             emit(event)
 
         stage = StillStage(

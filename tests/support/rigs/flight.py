@@ -188,6 +188,7 @@ def pipeline_of(
         path=path,
         detector_thread=detector_thread or DetectsAtOnce(),
         trust=trust or ViewTrust(None, hence=""),
+        edge_alike=tuple(edge_classes) == CLASSES,
         guesses=guesses,
         search=search,
     )
