@@ -8,6 +8,7 @@ It forwards, and looks into nothing. SIGINT and SIGTERM end it with exit code 0,
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -24,6 +25,8 @@ from hvt_common.transport.zenoh_config import LinkSettings, configure
 
 PROGRAM = "hvt-router"
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_ANEW = signal.SIGHUP
+"""A listener hears nothing any more: another session."""
 
 
 _ALL = Group()
@@ -67,11 +70,15 @@ def run(argv: Sequence[str] | None) -> int:
         raise UserError(f'{config.zenoh_config} says mode {mode}: a router needs mode: "router"')
     zenoh.init_log_from_env_or("error")
     # Blocked before Zenoh starts its threads, so that the signals wait for sigwait and reach nobody else.
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-    with open_session(settings) as session, link_doctor().watch(session, settings, served=lambda _name: True):
-        print(f"{PROGRAM} {session.zid()} listens on {', '.join(listen) or 'nothing'}", flush=True)
-        signal.sigwait(STOP_SIGNALS)
-    return 0
+    signal.pthread_sigmask(signal.SIG_BLOCK, (*STOP_SIGNALS, _ANEW))
+    while True:
+        with (
+            open_session(settings, on_deaf=lambda: os.kill(os.getpid(), _ANEW)) as session,
+            link_doctor().watch(session, settings, served=lambda _name: True),
+        ):
+            print(f"{PROGRAM} {session.zid()} listens on {', '.join(listen) or 'nothing'}", flush=True)
+            if signal.sigwait((*STOP_SIGNALS, _ANEW)) != _ANEW:
+                return 0
 
 
 if __name__ == "__main__":

@@ -7,10 +7,12 @@ import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Sequence
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import zenoh
 
 from hvt_common.errors import FlightError
 from hvt_common.runtime.clock import SteadyClock
@@ -107,6 +109,8 @@ class Ground:
         )
         """By edge, the summaries of sessions and the sinks that wrote them."""
         self._began_s = time.monotonic()
+        self._deaf = threading.Event()
+        """A listener hears nothing any more: the link is made anew."""
         self._models: Models | None = None
         self._state: GroundState | None = None
 
@@ -148,7 +152,6 @@ class Ground:
                     failures=models.failures,
                 )
                 stack.enter_context(server)
-            settings = config.link
             offered = (
                 one.serve(config, clock=self._clock, failures=models.failures) for one in extras_of(config)
             )
@@ -157,10 +160,11 @@ class Ground:
             watchers = [stack.enter_context(closing(_Watcher(one, models.failures))) for one in looking]
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
-            session = stack.enter_context(open_session(settings, failures=models.failures))
+            links = stack.enter_context(ExitStack())
+            session = links.enter_context(self._open_link(models))
             make_folders(config)
             set_aside(config)
-            client = EdgeClient.of_session(session, settings)
+            client = EdgeClient.of_session(session, config.link)
             for one in services:
                 one.begin(client)
             factory = SessionFactory(
@@ -173,6 +177,36 @@ class Ground:
                 program=self._program,
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
+            page = "" if view is None else view.page
+            serve = partial(self._serve_link, models=models, services=services, watchers=watchers, view=page)
+            try:
+                while serve(session, factory, line):
+                    links.close()
+                    session = links.enter_context(self._open_link(models))
+                    client.go_on(session)
+            except Exception as error:
+                if models.error is not None:
+                    raise models.error from None
+                raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
+
+    def _open_link(self, models: Models) -> AbstractContextManager[zenoh.Session]:
+        self._deaf.clear()
+        return open_session(self._config.link, failures=models.failures, on_deaf=self._deaf.set)
+
+    def _serve_link(
+        self,
+        session: zenoh.Session,
+        factory: SessionFactory,
+        line: StatusLine,
+        *,
+        models: Models,
+        services: Sequence[Service],
+        watchers: Sequence[_Watcher],
+        view: str,
+    ) -> bool:
+        # Serve its edges; returns whether to go on with another session. ``view`` is the address of the viewer.
+        config = self._config
+        with ExitStack() as stack:
             group = None
             if config.group is not None:
                 shown = next((one.shown_to_others for one in services if one.shown_to_others), "")
@@ -187,29 +221,27 @@ class Ground:
                     clock=self._clock,
                     group=group,
                     log=log,
-                    loses=loses_declarations(settings, session),
+                    loses=loses_declarations(config.link, session),
                 )
             )
-            watch = stack.enter_context(link_doctor().watch(session, settings, served=link.is_known))
+            watch = stack.enter_context(link_doctor().watch(session, config.link, served=link.is_known))
             self._on_started()
             notify_systemd("READY=1")
             self._say_where(
                 line,
-                view="" if view is None else view.page,
+                view=view,
                 pages=[link for one in services for link in one.links],
                 late={one.part for one in models.failures.now},
             )
             try:
-                try:
-                    self._serve(link, factory, line, watch, models, watchers, group)
+                self._serve(link, factory, line, watch, models, watchers, group)
+                again = self._deaf.is_set() and not self._stop.is_set()
+                if not again:
                     models.give_up()
-                finally:
-                    self._close_edges()
-                self._raise_error()
-            except Exception as error:
-                if models.error is not None:
-                    raise models.error from None
-                raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
+            finally:
+                self._close_edges()
+            self._raise_error()
+        return again
 
     def _summaries(self, models: Models) -> list[dict[str, Any]]:
         return [
@@ -270,7 +302,7 @@ class Ground:
                 for one in watchers:
                     one.show(self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
-            if config.once and self._all_ended(loading=models.loading):
+            if self._deaf.is_set() or (config.once and self._all_ended(loading=models.loading)):
                 return
 
     def _serve_edge(self, port: EdgePort, factory: SessionFactory) -> EdgeSessions:

@@ -357,6 +357,10 @@ class EdgeClient:
         """Ask through a session that is open, which its owner closes."""
         return cls(session, requester=Requester.of(settings))
 
+    def go_on(self, session: zenoh.Session) -> None:
+        """Ask through another session from now on."""
+        self._session = session
+
     def nobody(self) -> str:
         """The sentence for a user if `names` is empty."""
         return f"no edge is there{_link_hint(self._session)}"

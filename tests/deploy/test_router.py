@@ -106,6 +106,9 @@ def test_a_signal_ends_it_cleanly(free_port: int, how: signal.Signals) -> None:
     calling = LinkSettings(role="edge", connect=(endpoint,))
     with router("--listen", endpoint) as process, open_session(calling) as edge:
         eventually(lambda: list(edge.info.routers_zid()))
+        process.send_signal(signal.SIGHUP)  # as where a listener hears nothing any more: another session
+        assert process.stdout is not None
+        assert "listens on" in process.stdout.readline()
         process.send_signal(how)
         assert process.wait() == 0
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,6 +23,8 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import Extra, Service
 from programs.outsider import joined
 from programs.processes import eventually
+
+ALIVE = "hvt/uav-1/alive"
 
 
 def config(port: int, folder: Path | None, **changes: Any) -> GroundConfig:
@@ -67,7 +71,7 @@ def test_once_it_ends_when_who_came_left_without_a_picture(free_port: int, tmp_p
     run = Run(config(free_port, tmp_path, once=True, wait=60.0))
     try:
         with joined(f"tcp/127.0.0.1:{free_port}") as outsider:
-            with outsider.liveliness().declare_token("hvt/uav-1/alive"):
+            with outsider.liveliness().declare_token(ALIVE):
                 eventually(lambda: "hvt-receive-uav-1" in [one.name for one in threading.enumerate()])
                 clock.now_s = 61.0
                 time.sleep(0.5)
@@ -105,6 +109,25 @@ def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path, cl
     time.sleep(0.5)
     assert not run.over
     run.stop.set()
+    eventually(lambda: run.over, what="the ground has ended")
+
+
+def test_a_listener_that_hears_nothing_any_more_is_made_anew(
+    free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No picture would come back once the ground's radio was plugged in anew, or the ground stood still."""
+    answers = iter([[]])
+    there = socket.if_nameindex()
+    monkeypatch.setattr(socket, "if_nameindex", lambda: next(answers, there))
+    listen = (f"tcp/127.0.0.1:{free_port}#iface=lo",)
+    run = Run(replace(config(free_port, tmp_path), listen=listen))
+    try:
+        eventually(lambda: "listener: works again" in caplog.text)
+        assert "hears nothing any more, since its interface was removed: the link is made anew" in caplog.text
+        with joined(f"tcp/127.0.0.1:{free_port}") as outsider, outsider.liveliness().declare_token(ALIVE):
+            eventually(lambda: "hvt-receive-uav-1" in [one.name for one in threading.enumerate()])
+    finally:
+        run.stop.set()
     eventually(lambda: run.over, what="the ground has ended")
 
 

@@ -37,12 +37,18 @@ _MAY_COME = re.compile(
 
 
 @contextmanager
-def open_session(settings: LinkSettings, *, failures: Failures | None = None) -> Iterator[zenoh.Session]:
+def open_session(
+    settings: LinkSettings,
+    *,
+    failures: Failures | None = None,
+    on_deaf: Callable[[], None] | None = None,
+) -> Iterator[zenoh.Session]:
     """A running session; closed within a second on the way out, whatever state the link is in.
 
     A connecting side does not wait for the other: it goes on trying for as long as the session is open. With
-    ``failures`` so does a listening one whose address is not there yet or whose port is not free. Raises UserError
-    for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh logs to stderr.
+    ``failures`` so does a listening one whose address is not there yet or whose port is not free. ``on_deaf()`` is
+    called, in a thread, once a listener hears nothing any more and only another session helps. Raises UserError for
+    endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh logs to stderr.
     """
     config, listen = configure(settings)
     link_doctor().check_keys(config, listen=listen, name=settings.name, now_s=time.time())
@@ -55,8 +61,11 @@ def open_session(settings: LinkSettings, *, failures: Failures | None = None) ->
         if failures is None or not _MAY_COME.search(str(error)):
             raise UserError(why) from None
         session = _open_listening_later(config, listen, why, failures, stop)
+    else:
+        if failures is not None:
+            failures.works("listener")
     try:
-        with StaleSockets(session, config, failures or Failures(time.time_ns)):
+        with StaleSockets(session, config, failures or Failures(time.time_ns), on_deaf=on_deaf):
             yield session
     finally:
         stop.set()

@@ -11,7 +11,7 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,9 @@ UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 
 _LISTENER = "listener"
 _EVERY_S = 0.25
-_UNREAD_EVERY_S, _UNREAD_CHECKS = 1.0, 5
+_DEAF_EVERY_S, _DEAF_CHECKS = 1.0, 5
+_TIMESTAMPS, _BOUND_INTERFACE = 35, 62
+"""SO_TIMESTAMPNS and SO_BINDTOIFINDEX of Linux."""
 _HANGS_S = 0.5
 """A handshake that lasts longer is doubted: the place is probed, and again at this interval."""
 _PROBE_S = 3.0
@@ -63,19 +65,19 @@ def connections(table: Path, *, inodes: Container[str] | None = None) -> Iterato
 
 def listening_ends() -> set[str]:
     """Where sockets of this process listen or take datagrams."""
-    listening = {end for end, state, _ in _own(TCP_TABLES) if state == _LISTENING}
-    return listening | {end for end, *_ in _own(UDP_TABLES)}
+    listening = {end for end, state in _own(TCP_TABLES) if state == _LISTENING}
+    return listening | {end for end, _ in _own(UDP_TABLES)}
 
 
-def _own(tables: Iterable[Path]) -> Iterator[tuple[str, str, int]]:
-    # End, state and unread bytes of each socket of this process.
+def _own(tables: Iterable[Path]) -> Iterator[tuple[str, str]]:
+    # End and state of each socket of this process.
     own = own_sockets()
     for table in tables:
         with suppress(OSError):  # a kernel without IPv6
             for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                _, ours, _, state, queues, *_, inode = line.split(maxsplit=10)[:10]
+                _, ours, _, state, *_, inode = line.split(maxsplit=10)[:10]
                 if int(inode) in own:
-                    yield _end(ours), state, int(queues.partition(":")[2], 16)
+                    yield _end(ours), state
 
 
 def ends_of(end: str) -> set[str]:
@@ -106,8 +108,9 @@ class StaleSockets:
     one has its full time, should the other side be slow. Of a name with several addresses the first, where
     it is dark, would take all of ``open_timeout`` each time: it is shut down as soon as another one answers.
 
-    A UDP listener that is not read any more has failed, and ``failures`` says so: Zenoh's stands still for ever where
-    two datagrams wait from a link that ended while the program was stopped.
+    A listener that hears nothing any more has failed, and ``failures`` says so: Zenoh's of UDP stands still for ever
+    where two datagrams wait from a link that ended while the program was stopped, and one that is bound to an
+    interface does not survive it. Nothing but another session helps: ``on_deaf()`` is told, once.
 
     Other sockets of the process are none of its business, even where they are connected to the same place: Zenoh's
     have the send buffer that its configuration says. A link of any session here is no handshake.
@@ -116,9 +119,17 @@ class StaleSockets:
     _sessions: ClassVar[list[zenoh.Session]] = []
     """All that are watched in this process."""
 
-    def __init__(self, session: zenoh.Session, config: zenoh.Config, failures: Failures) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: zenoh.Config,
+        failures: Failures,
+        *,
+        on_deaf: Callable[[], None] | None = None,
+    ) -> None:
         self._session = session
         self._failures = failures
+        self._on_deaf = on_deaf
         self._open_s = int(config.get_json("transport/unicast/open_timeout")) / 1000
         self._tables = [one for one in TCP_TABLES if one.exists()]
         self._places = {end_of(one) for one in connect_endpoints(config)}
@@ -136,12 +147,16 @@ class StaleSockets:
         self._same_name: dict[str, list[str]] = {}
         """The other addresses of a name, of a place that was probed."""
         self._spare_until_s = 0.0
-        listen = re.findall(r'"(?:udp|quic)/[^"]*?:(\d+)["?#]', config.get_json("listen/endpoints"))
-        self._datagram_ports = set(listen)
-        self._unread: dict[str, tuple[int, int]] = {}
-        """Bytes that wait at a UDP listener, and for how many checks they have not become fewer."""
-        self._next_unread_s = 0.0
-        self._deaf = False
+        listen = re.findall(r'"((\w+)/[^"]*?:(\d+)(?=["?#])[^"]*)', config.get_json("listen/endpoints"))
+        self._deaf_ports = {
+            int(port) for one, kind, port in listen if kind == "udp" or re.search(r"%|\biface=", one)
+        }
+        """Of listeners that may go deaf."""
+        self._listen_ports = {int(port) for *_, port in listen}
+        self._first: dict[int, tuple[bytes, int]] = {}
+        """What waits first at each UDP listener, and for how many checks."""
+        self._next_deaf_s = 0.0
+        self._deaf: set[str] = set()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-sockets", daemon=True)
 
@@ -168,9 +183,9 @@ class StaleSockets:
                 self._check(time.monotonic())
 
     def _check(self, now_s: float) -> None:
-        if self._datagram_ports and now_s >= self._next_unread_s:
-            self._next_unread_s = now_s + _UNREAD_EVERY_S
-            self.check_unread()
+        if self._deaf_ports and now_s >= self._next_deaf_s:
+            self._next_deaf_s = now_s + _DEAF_EVERY_S
+            self.check_listeners()
         own = self._zenohs()
         self._done = {inode for inode, fd in own.items() if inode in self._done or _linger_ended(fd, inode)}
         if not self._ports:
@@ -200,21 +215,43 @@ class StaleSockets:
         for inode in dark:
             _shut_down(own[inode], inode)
 
-    def check_unread(self) -> None:
-        """Say of a UDP listener that it is not read; call it about once a second."""
-        before, self._unread = self._unread, {}
-        for end, _, size in _own(UDP_TABLES):
-            port = end.rpartition(":")[2]
-            if size and port in self._datagram_ports:
-                least, checks = before.get(end, (0, 0))
-                self._unread[end] = (size, checks + 1 if size >= least else 1)
-        deaf = [end for end, (_, checks) in self._unread.items() if checks > _UNREAD_CHECKS]
+    def check_listeners(self) -> None:
+        """Say of a listener that it hears nothing any more; call it about once a second."""
+        if self._deaf and self._on_deaf is not None:
+            return  # another session is on its way
+        deaf, before, self._first = set(), self._first, {}
+        interfaces = {0, *(index for index, _ in socket.if_nameindex())}
+        for inode, fd in own_sockets().items():
+            with suppress(OSError), same_socket(fd, inode) as one:
+                if not _is_listener(one, self._deaf_ports):
+                    continue
+                end = _end_of_name(one.getsockname())
+                if one.getsockopt(socket.SOL_SOCKET, _BOUND_INTERFACE) not in interfaces:
+                    deaf.add(f"{end} hears nothing any more, since its interface was removed")
+                elif one.type == socket.SOCK_DGRAM and (first := _first_of(one)):
+                    known, checks = before.get(inode, (b"", 0))
+                    self._first[inode] = first, checks + 1 if first == known else 0
+                    if self._first[inode][1] >= _DEAF_CHECKS:
+                        why = "is not read any more, as may happen to a program that was stopped for some seconds"
+                        deaf.add(f"what comes to udp {end} {why}")
         if deaf and not self._deaf:
-            why = "is not read any more, as may happen to a program that was stopped for some seconds: restart it"
-            self._failures.failed(_LISTENER, f"what comes to udp {', '.join(deaf)} {why}", last=True)
+            remedy = "restart it" if self._on_deaf is None else "the link is made anew"
+            self._failures.failed(_LISTENER, f"{', '.join(sorted(deaf))}: {remedy}", last=True)
+            if self._on_deaf is not None:
+                self._free_ports()
+                self._on_deaf()
         elif self._deaf and not deaf:
             self._failures.works(_LISTENER)
-        self._deaf = bool(deaf)
+        self._deaf = deaf
+
+    def _free_ports(self) -> None:
+        # Zenoh cannot close a session whose listener stands still, and the next one could not listen: leave it
+        # sockets without a port.
+        for inode, fd in own_sockets().items():
+            with suppress(OSError), same_socket(fd, inode) as one:
+                if _is_listener(one, self._listen_ports):
+                    with socket.socket(one.family, one.type) as other:
+                        os.dup2(other.fileno(), fd, inheritable=False)
 
     def _zenohs(self) -> dict[int, int]:
         # Inode → descriptor. Each socket is looked at once: a host program may have thousands.
@@ -296,6 +333,21 @@ def _given_buffer(size: int) -> int:
     with socket.socket() as one:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, min(size, 2**31 - 1))
         return one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+
+
+def _is_listener(one: socket.socket, ports: Container[int]) -> bool:
+    if one.family not in _FAMILIES or one.getsockname()[1] not in ports:
+        return False
+    datagrams = one.type == socket.SOCK_DGRAM
+    return datagrams or bool(one.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
+
+
+def _first_of(one: socket.socket) -> bytes:
+    # When the datagram came that waits there first, which tells it from all others; empty where none does.
+    one.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+    with suppress(BlockingIOError):
+        return b"".join(data for *_, data in one.recvmsg(1, 64, socket.MSG_PEEK | socket.MSG_DONTWAIT)[1])
+    return b""
 
 
 def _state(one: socket.socket) -> int:
