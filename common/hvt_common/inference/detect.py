@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of
 from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.heads.choose import Trial, check_head_name, choose_head, trial_pictures
-from hvt_common.inference.heads.contract import is_like
+from hvt_common.inference.heads.contract import HeadOutput, is_like
 from hvt_common.inference.labels import (
     USUAL_CONFIDENCE,
     class_labels,
@@ -25,7 +24,7 @@ from hvt_common.inference.labels import (
     detector_labels,
     read_labels,
 )
-from hvt_common.inference.letterbox import Letterboxer, as_bgr, prepared_as, without_palette
+from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr, prepared_as, without_palette
 from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
 from hvt_common.inference.runtimes.first_steps import own_steps
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
@@ -48,9 +47,9 @@ _OURS = "hvt.training_commit"
 _ENLARGE_TO = "hvt.enlarge_to"
 _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
-_THERMAL_SHARE, _THERMAL_RAISED = 0.75, 0.3
-"""A small picture without colour is enlarged to this share of that side: twice as large, 640x512 shows a third fewer
-people. The second network of a file is silent there and cannot agree (`averaged`): scores rise by this, of the logit.
+_THERMAL_SHARE, _SECOND_SHARE = 0.65, 0.76
+"""A small picture without colour is enlarged to this share of that side: larger, 640x512 shows people that are none.
+The second network of a file is silent there; a second run, at this share of the size, agrees instead (`averaged`).
 """
 _BROKEN = 0.1
 """Where no more of an answer is no number, that is some cells; the scores of one class are a fifth."""
@@ -242,22 +241,14 @@ class OnnxDetector:
         image = as_bgr(image_bgr)
         image, is_grey = without_palette(image) if self._enlarge_to else (image, False)
         thermal = is_grey and max(image.shape) < self._enlarge_to
-        input_size = self.input_size((image.shape[1], image.shape[0]), share=share, thermal=thermal)
-        tensor, letterbox = self._letterboxer.fill(image, input_size)
         least = min(self._confidence, WEAK) if self._averages else self._confidence
-        outputs = self._run(tensor)
-        try:
-            found = self.head.decode(outputs, confidence=least, input_size=input_size)
-        except UserError as error:
-            raise UserError(f"model {self.model.path} {error}") from None
-        used = [outputs[index] for index in self.head.outputs]
-        if not len(found.scores) and any(np.isnan(one).sum() > _BROKEN * one.size for one in used):
-            raise UserError(f"model {self.model.path} answers a picture with what is no number (NaN)")
-        if not len(found.scores) and found.beyond:
-            raise UserError(
-                f"model {self.model.path} answers a picture with confidences above 1: it is not {self.head.name},"
-                " or is broken"
-            )
+        size = (image.shape[1], image.shape[0])
+        whole, smaller = (
+            self.input_size(size, share=share * part, thermal=thermal) for part in (1.0, _SECOND_SHARE)
+        )
+        found, letterbox = self._candidates(image, whole, least)
+        if thermal and smaller != whole:
+            found = _joined(found, letterbox, *self._candidates(image, smaller, least))
         if self.head.suppresses:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids
@@ -267,8 +258,6 @@ class OnnxDetector:
         boxes, scores = found.boxes_input_px[selected], found.scores[selected]
         if self.head.suppresses and self._averages:
             boxes, scores = averaged(*candidates, selected, iou=self._nms_iou, second=found.second)
-            if thermal and found.second is not None:
-                scores = np.asarray(scores / (scores + (1 - scores) * math.exp(-_THERMAL_RAISED)), np.float32)
             best = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores >= self._confidence)]
             boxes, scores, selected = boxes[best], scores[best], selected[best]
         boxes = letterbox.to_image(boxes)
@@ -289,6 +278,26 @@ class OnnxDetector:
             )
         inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & named
         return Detections(boxes[inside], scores[inside], class_ids[inside])
+
+    def _candidates(
+        self, image: Image, input_size: tuple[int, int], least: float
+    ) -> tuple[HeadOutput, Letterbox]:
+        # The answer of the network to the picture at one size, from a score of ``least`` on.
+        tensor, letterbox = self._letterboxer.fill(image, input_size)
+        outputs = self._run(tensor)
+        try:
+            found = self.head.decode(outputs, confidence=least, input_size=input_size)
+        except UserError as error:
+            raise UserError(f"model {self.model.path} {error}") from None
+        used = [outputs[index] for index in self.head.outputs]
+        if not len(found.scores) and any(np.isnan(one).sum() > _BROKEN * one.size for one in used):
+            raise UserError(f"model {self.model.path} answers a picture with what is no number (NaN)")
+        if not len(found.scores) and found.beyond:
+            raise UserError(
+                f"model {self.model.path} answers a picture with confidences above 1: it is not {self.head.name},"
+                " or is broken"
+            )
+        return found, letterbox
 
     def input_size(
         self, image_size: tuple[int, int], *, share: float = 1.0, thermal: bool = False
@@ -363,6 +372,18 @@ class OnnxDetector:
         return Trial(
             self.model.outputs, _of_one_form(self.model, runs), tops, size, self.model.metadata, names
         )
+
+
+def _joined(a: HeadOutput, a_lies: Letterbox, b: HeadOutput, b_lies: Letterbox) -> HeadOutput:
+    # Two looks at one picture: boxes in the pixels of the first, ``second`` tells those of the other.
+    (a_corner, a_size), (b_corner, b_size) = (np.array(one.content).reshape(2, 2) for one in (a_lies, b_lies))
+    boxes = (b.boxes_input_px.reshape(-1, 2, 2) - b_corner) * (a_size / b_size) + a_corner
+    return HeadOutput(
+        np.concatenate([a.boxes_input_px, boxes.reshape(-1, 4).astype(np.float32)]),
+        np.concatenate([a.scores, b.scores]),
+        np.concatenate([a.class_ids, b.class_ids]),
+        second=np.arange(len(a.scores) + len(b.scores)) >= len(a.scores),
+    )
 
 
 def _of_one_form(model: OnnxModel, runs: list[list[npt.NDArray[Any]]]) -> list[list[npt.NDArray[Any]]]:
