@@ -160,6 +160,10 @@ class Edge:
             raise self._broken_off(str(broken)) from broken
         return self._summary(stages.heartbeat)
 
+    def in_hand(self) -> frozenset[tuple[str, int]]:
+        """As of `Failures`; for another thread."""
+        return self._failures.in_hand()
+
     def given_up(self) -> FlightError:
         """The end of a run that hangs after ``stop`` was set; for another thread."""
         return self._broken_off(self._failures.hanging)

@@ -94,7 +94,9 @@ def _run(argv: Sequence[str] | None) -> int:
 
     with log.ending():
         edge = Edge(config, stop=stop, on_started=log.release, world=world)
-        content = reported(partial(ended_in_time, edge.run, stop, otherwise=edge.given_up), report)
+        content = reported(
+            partial(ended_in_time, edge.run, stop, in_hand=edge.in_hand, otherwise=edge.given_up), report
+        )
     return 1 if in_vain(content) else 0
 
 

@@ -130,6 +130,10 @@ class Ground:
             raise
         return self._summaries(models)
 
+    def in_hand(self) -> frozenset[tuple[str, int]]:
+        """As of `Failures`; for another thread."""
+        return self._models.failures.in_hand() if self._models else frozenset()
+
     def given_up(self) -> FlightError:
         """The end of a run that hangs after ``stop`` was set; for another thread."""
         if self._models is None:

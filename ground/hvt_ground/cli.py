@@ -96,7 +96,10 @@ def _run(argv: Sequence[str] | None) -> int:
 
     with log.ending():
         ground = Ground(config, stop=stop, on_started=log.release)
-        reported(partial(ended_in_time, ground.run, stop, otherwise=ground.given_up), report)
+        reported(
+            partial(ended_in_time, ground.run, stop, in_hand=ground.in_hand, otherwise=ground.given_up),
+            report,
+        )
     return 0
 
 

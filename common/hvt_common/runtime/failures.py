@@ -102,11 +102,15 @@ class Failures:
             if not (one.working or one.over)
         )
 
+    def in_hand(self) -> frozenset[tuple[str, int]]:
+        """The turns that have begun and not ended: name of the part, and a number that no other turn of it has."""
+        with self._lock:
+            return frozenset((one.name, one.count) for one in self._watched if one.count % 2)
+
     @property
     def hanging(self) -> str:
         """That the program hangs as it ends, a sentence, and which of its parts do not answer."""
-        with self._lock:
-            names = sorted(one.name for one in self._watched if one.count % 2)
+        names = sorted(name for name, _ in self.in_hand())
         where = f": {', '.join(names)}" if names else ""
         return f"it was stopped, and something in it hangs{where}; what was written until then is kept"
 

@@ -35,6 +35,8 @@ _CHECK_EVERY_S = 0.1
 _SECOND_SIGNAL_S = 1.0
 _END_WITHIN_S = 9.0
 """systemd (TimeoutStopSec of deploy/) and Docker kill it after 10 s."""
+_END_SLOWLY_WITHIN_S = 60.0
+"""For a run of which no part hangs: the disk of its files may be slow."""
 
 # Parameters of mallopt, glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
@@ -72,15 +74,25 @@ def stop_on_signals() -> threading.Event:
     return stop
 
 
-def ended_in_time(run: Callable[[], T], stop: threading.Event, *, otherwise: Callable[[], Exception]) -> T:
+def ended_in_time(
+    run: Callable[[], T],
+    stop: threading.Event,
+    *,
+    in_hand: Callable[[], frozenset[tuple[str, int]]],
+    otherwise: Callable[[], Exception],
+) -> T:
     """Run it in a thread, and return its result; raise ``otherwise()`` where something hangs after ``stop`` is set.
 
-    The main thread is left to signals: one that is in a native library heeds none.
+    ``in_hand()`` has the turns of parts that have begun and not ended: one that is there 9 s later hangs. The main
+    thread is left to signals: one that is in a native library heeds none.
     """
     done = _in_thread(run, name="hvt-run")
     while not wait([done], timeout=_CHECK_EVERY_S).done and not stop.is_set():
         pass
-    if not wait([done], timeout=_END_WITHIN_S).done:
+    before = in_hand()
+    if not wait([done], timeout=_END_WITHIN_S).done and not before & in_hand():
+        wait([done], timeout=_END_SLOWLY_WITHIN_S - _END_WITHIN_S)
+    if not done.done():
         raise otherwise()
     return done.result()
 
