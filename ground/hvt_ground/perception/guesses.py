@@ -105,7 +105,7 @@ class Guesses:
     def doubting(self, still: Refinement, *, unlike: bool) -> Refinement:
         """The reading of a still, doubted where it is not sure and has no track or that of a guess.
 
-        All are guesses where the view is ``unlike`` what the detector knows.
+        All are guesses where the detector does not know the view (``unlike``).
         """
         if still.unread or are_firm([still.box_base_px], [still.confidence], scale=self._scale)[0]:
             return still

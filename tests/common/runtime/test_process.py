@@ -51,9 +51,8 @@ def hang():
     time.sleep(3600 if hanging else 1)
 
 try:
-    process.ended_in_time(
-        hang, stop, in_hand=lambda: frozenset({("encoder", 1)}) if hanging else frozenset(), otherwise=lambda: FlightError("it hangs")
-    )
+    in_hand = frozenset({("encoder", 1)} if hanging else ())
+    process.ended_in_time(hang, stop, in_hand=lambda: in_hand, otherwise=lambda: FlightError("it hangs"))
 except FlightError:
     process.leave(1)
 """
