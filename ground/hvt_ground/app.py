@@ -54,6 +54,8 @@ _MOST_SUMMARIES = 256
 """Limit for an edge: one that restarts for weeks must not fill the memory."""
 _MOST_MOVED = 256
 """Limit of edges that have left, for the same reason."""
+_BACK_WITHIN_S = 60.0
+"""With ``--once``, the least time for edges to come back over a link that was made anew."""
 
 
 class _Watcher:
@@ -111,6 +113,7 @@ class Ground:
         self._began_s = time.monotonic()
         self._deaf = threading.Event()
         """A listener hears nothing any more: the link is made anew."""
+        self._anew = False
         self._models: Models | None = None
         self._state: GroundState | None = None
 
@@ -186,6 +189,7 @@ class Ground:
             try:
                 while serve(session, factory, line):
                     links.close()
+                    self._anew, self._began_s = True, time.monotonic()
                     session = links.enter_context(self._open_link(models))
                     client.go_on(session)
             except Exception as error:
@@ -351,9 +355,10 @@ class Ground:
     def _all_ended(self, *, loading: bool) -> bool:
         edges = self._edges.values()
         gone = all(one.idle and not one.port.present.is_set() for one in edges)
-        if not any(one.ended for one in edges):  # nobody came, or who came left without a picture
-            waited_s = time.monotonic() - self._began_s
-            return gone and not loading and 0 < self._config.wait < waited_s
+        if not any(one.ended for one in edges):
+            # Nobody came, who came left without a picture, or who left has nothing to come back for.
+            waits_s = max(self._config.wait, _BACK_WITHIN_S * self._anew)
+            return gone and not loading and 0 < waits_s < time.monotonic() - self._began_s
         return gone
 
     def _close_edges(self) -> None:

@@ -113,22 +113,32 @@ def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path, cl
 
 
 def test_a_listener_that_hears_nothing_any_more_is_made_anew(
-    free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    free_port: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    clock: SimpleNamespace,
 ) -> None:
-    """No picture would come back once the ground's radio was plugged in anew, or the ground stood still."""
+    """No picture would come back once the ground's radio was plugged in anew, or the ground stood still.
+
+    With ``--once`` it would end before an edge can have come back, or never if none does.
+    """
     answers = iter([[]])
     there = socket.if_nameindex()
     monkeypatch.setattr(socket, "if_nameindex", lambda: next(answers, there))
     listen = (f"tcp/127.0.0.1:{free_port}#iface=lo",)
-    run = Run(replace(config(free_port, tmp_path), listen=listen))
+    run = Run(replace(config(free_port, tmp_path, once=True, wait=20.0), listen=listen))
     try:
         eventually(lambda: "listener: works again" in caplog.text)
         assert "hears nothing any more, since its interface was removed: the link is made anew" in caplog.text
+        clock.now_s = 30.0
+        time.sleep(0.5)  # it looks several times
         with joined(f"tcp/127.0.0.1:{free_port}") as outsider, outsider.liveliness().declare_token(ALIVE):
             eventually(lambda: "hvt-receive-uav-1" in [one.name for one in threading.enumerate()])
+        clock.now_s = 61.0
+        eventually(lambda: run.over, what="the ground has ended")
     finally:
         run.stop.set()
-    eventually(lambda: run.over, what="the ground has ended")
 
 
 class Brings(Extra):
