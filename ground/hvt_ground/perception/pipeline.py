@@ -431,6 +431,8 @@ class Pipeline:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. Tracks
         # that the edge sees with another detector are not touched.
         guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
+        if guesses is None and not self.trust.unlike:
+            return shown
         doubted = shown.doubted
         firm = shown.refined & are_firm(shown.boxes_base_px, shown.confidences, scale=self._scale)
         if guesses is not None:
