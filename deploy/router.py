@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ import zenoh
 
 from hvt_common.config import PATH, TEXT, Group, load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
@@ -71,14 +73,16 @@ def run(argv: Sequence[str] | None) -> int:
     zenoh.init_log_from_env_or("error")
     # Blocked before Zenoh starts its threads, so that the signals wait for sigwait and reach nobody else.
     signal.pthread_sigmask(signal.SIG_BLOCK, (*STOP_SIGNALS, _ANEW))
+    failures = None  # at the start a port that is in use ends it
     while True:
         with (
-            open_session(settings, on_deaf=lambda: os.kill(os.getpid(), _ANEW)) as session,
+            open_session(settings, failures=failures, on_deaf=lambda: os.kill(os.getpid(), _ANEW)) as session,
             link_doctor().watch(session, settings, served=lambda _name: True),
         ):
             print(f"{PROGRAM} {session.zid()} listens on {', '.join(listen) or 'nothing'}", flush=True)
             if signal.sigwait((*STOP_SIGNALS, _ANEW)) != _ANEW:
                 return 0
+        failures = failures or Failures(time.time_ns)
 
 
 if __name__ == "__main__":

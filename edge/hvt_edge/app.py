@@ -153,11 +153,12 @@ class Edge:
                 if not self._counts.encoded:
                     raise
                 broken = error
+                self._failures.failed(_PART, str(error), said=True)
             finally:
                 stages.stills.chooser.close()
                 self._say_goodbye(stages, link)
         if broken is not None:
-            raise self._broken_off(str(broken)) from broken
+            raise FlightError(str(broken), summary=self._summary(stages.heartbeat)) from broken
         return self._summary(stages.heartbeat)
 
     def in_hand(self) -> frozenset[tuple[str, int]]:
@@ -166,9 +167,7 @@ class Edge:
 
     def given_up(self) -> FlightError:
         """The end of a run that hangs after ``stop`` was set; for another thread."""
-        return self._broken_off(self._failures.hanging)
-
-    def _broken_off(self, reason: str) -> FlightError:
+        reason = self._failures.hanging
         self._failures.failed(_PART, reason, said=True)
         return FlightError(reason, summary=self._heartbeat and self._summary(self._heartbeat))
 

@@ -113,7 +113,7 @@ class Ground:
         self._began_s = time.monotonic()
         self._deaf = threading.Event()
         """A listener hears nothing any more: the link is made anew."""
-        self._anew = False
+        self._anew = self._begun = False
         self._models: Models | None = None
         self._state: GroundState | None = None
 
@@ -195,6 +195,8 @@ class Ground:
             except Exception as error:
                 if models.error is not None:
                     raise models.error from None
+                if not self._begun:
+                    raise
                 raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
 
     def _open_link(self, models: Models) -> AbstractContextManager[zenoh.Session]:
@@ -234,6 +236,7 @@ class Ground:
             )
             watch = stack.enter_context(link_doctor().watch(session, config.link, served=link.is_known))
             self._on_started()
+            self._begun = True
             notify_systemd("READY=1")
             self._say_where(
                 line,
@@ -306,6 +309,9 @@ class Ground:
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
                 give_back_holes()
+                failed = {one.part for one in models.failures.now}
+                if self._anew and "listener" in failed:
+                    self._began_s = time.monotonic()  # nobody can come back yet
                 self._state = maker.make(sorted(self._edges.items()))
                 for one in watchers:
                     one.show(self._state)

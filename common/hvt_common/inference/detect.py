@@ -247,7 +247,7 @@ class OnnxDetector:
             self.input_size(size, share=share * part, thermal=thermal) for part in (1.0, _SECOND_SHARE)
         )
         found, letterbox = self._candidates(image, whole, least)
-        if thermal and smaller != whole:
+        if thermal and smaller != whole and self._averages and self.head.suppresses:
             found = _joined(found, letterbox, *self._candidates(image, smaller, least))
         if self.head.suppresses:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]

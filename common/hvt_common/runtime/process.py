@@ -34,9 +34,9 @@ _JOIN_WITHIN_S = 30.0
 _CHECK_EVERY_S = 0.1
 _SECOND_SIGNAL_S = 1.0
 _END_WITHIN_S = 9.0
-"""systemd (TimeoutStopSec of deploy/) and Docker kill it after 10 s."""
-_END_SLOWLY_WITHIN_S = 60.0
-"""For a run of which no part hangs: the disk of its files may be slow."""
+"""Docker, where it is not told otherwise, kills it after 10 s."""
+_END_SLOWLY_WITHIN_S = 30.0
+"""For a run of which no part hangs: the disk of its files may be slow. Those of deploy/ kill it after 40 s."""
 
 # Parameters of mallopt, glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
@@ -56,17 +56,18 @@ def stop_on_signals() -> threading.Event:
     """Return an event that these signals set from now on, so that the run ends with its summary and files whole.
 
     A second one ends the process at once, with the code of a shell; not one that comes with the first, as from a
-    terminal and ``timeout``. ``nohup`` has SIGHUP ignored, and so it stays.
+    terminal and ``timeout``, nor a terminal that is closed meanwhile. ``nohup`` has SIGHUP ignored, and so it stays.
     """
     stop = threading.Event()
     began_s = math.inf
 
     def heed(number: int, _frame: object) -> None:
         nonlocal began_s
-        if time.monotonic() - began_s > _SECOND_SIGNAL_S:
+        if began_s == math.inf:
+            began_s = time.monotonic()
+            stop.set()  # once: the first signal may be within it when the second comes
+        elif number != signal.SIGHUP and time.monotonic() - began_s > _SECOND_SIGNAL_S:
             os._exit(128 + number)
-        began_s = min(began_s, time.monotonic())
-        stop.set()
 
     for one in STOP_SIGNALS:
         if one is not signal.SIGHUP or signal.getsignal(one) is not signal.SIG_IGN:

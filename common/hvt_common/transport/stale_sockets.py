@@ -28,6 +28,7 @@ UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 _LISTENER = "listener"
 _EVERY_S = 0.25
 _DEAF_EVERY_S, _DEAF_CHECKS = 1.0, 5
+_TYPES = {"udp": socket.SOCK_DGRAM, "quic": socket.SOCK_DGRAM}
 _TIMESTAMPS, _BOUND_INTERFACE = 35, 62
 """SO_TIMESTAMPNS and SO_BINDTOIFINDEX of Linux."""
 _HANGS_S = 0.5
@@ -148,11 +149,14 @@ class StaleSockets:
         """The other addresses of a name, of a place that was probed."""
         self._spare_until_s = 0.0
         listen = re.findall(r'"((\w+)/[^"]*?:(\d+)(?=["?#])[^"]*)', config.get_json("listen/endpoints"))
+        self._listen_ports = {(_TYPES.get(kind, socket.SOCK_STREAM), int(port)) for _, kind, port in listen}
+        """Type of the socket, and port."""
         self._deaf_ports = {
-            int(port) for one, kind, port in listen if kind == "udp" or re.search(r"%|\biface=", one)
+            (_TYPES.get(kind, socket.SOCK_STREAM), int(port))
+            for one, kind, port in listen
+            if kind == "udp" or re.search(r"%|\biface=", one)
         }
         """Of listeners that may go deaf."""
-        self._listen_ports = {int(port) for *_, port in listen}
         self._first: dict[int, tuple[bytes, int]] = {}
         """What waits first at each UDP listener, and for how many checks."""
         self._next_deaf_s = 0.0
@@ -226,7 +230,7 @@ class StaleSockets:
                 if not _is_listener(one, self._deaf_ports):
                     continue
                 end = _end_of_name(one.getsockname())
-                if one.getsockopt(socket.SOL_SOCKET, _BOUND_INTERFACE) not in interfaces:
+                if _interface_of(one) not in interfaces:
                     deaf.add(f"{end} hears nothing any more, since its interface was removed")
                 elif one.type == socket.SOCK_DGRAM and (first := _first_of(one)):
                     known, checks = before.get(inode, (b"", 0))
@@ -246,12 +250,14 @@ class StaleSockets:
 
     def _free_ports(self) -> None:
         # Zenoh cannot close a session whose listener stands still, and the next one could not listen: leave it
-        # sockets without a port.
+        # sockets without a port, and end its other links, or those at their other ends would stay with it.
         for inode, fd in own_sockets().items():
             with suppress(OSError), same_socket(fd, inode) as one:
                 if _is_listener(one, self._listen_ports):
                     with socket.socket(one.family, one.type) as other:
                         os.dup2(other.fileno(), fd, inheritable=False)
+                elif one.family in _FAMILIES and _type_and_port(one) in self._listen_ports:
+                    one.shutdown(socket.SHUT_RDWR)
 
     def _zenohs(self) -> dict[int, int]:
         # Inode → descriptor. Each socket is looked at once: a host program may have thousands.
@@ -335,18 +341,33 @@ def _given_buffer(size: int) -> int:
         return one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
 
 
-def _is_listener(one: socket.socket, ports: Container[int]) -> bool:
-    if one.family not in _FAMILIES or one.getsockname()[1] not in ports:
+def _is_listener(one: socket.socket, ports: Container[tuple[int, int]]) -> bool:
+    if one.family not in _FAMILIES or _type_and_port(one) not in ports:
         return False
     datagrams = one.type == socket.SOCK_DGRAM
     return datagrams or bool(one.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
 
 
+def _type_and_port(one: socket.socket) -> tuple[int, int]:
+    return one.type, one.getsockname()[1]
+
+
+def _interface_of(one: socket.socket) -> int:
+    with suppress(OSError):  # Linux before 5.1
+        return one.getsockopt(socket.SOL_SOCKET, _BOUND_INTERFACE)
+    return 0
+
+
 def _first_of(one: socket.socket) -> bytes:
     # When the datagram came that waits there first, which tells it from all others; empty where none does.
-    one.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+    peek = socket.MSG_PEEK | socket.MSG_DONTWAIT
     with suppress(BlockingIOError):
-        return b"".join(data for *_, data in one.recvmsg(1, 64, socket.MSG_PEEK | socket.MSG_DONTWAIT)[1])
+        one.recvmsg(1, 0, peek)
+        one.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+        try:
+            return b"".join(data for *_, data in one.recvmsg(1, 64, peek)[1])
+        finally:  # Zenoh's buffer has room for the address alone at which a datagram came
+            one.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 0)
     return b""
 
 

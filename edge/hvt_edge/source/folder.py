@@ -6,7 +6,7 @@ import logging
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
@@ -27,8 +27,9 @@ _log = logging.getLogger(__name__)
 
 _MOSTLY = 0.5
 """Share of the steps from one number to the next that must be 1 for others to be gaps."""
-_NAMED = ".jpg .jpeg .jpe .jfif .png .bmp .webp .tif .tiff .jp2 .pgm .ppm .pnm"
-_ENDINGS = frozenset(_NAMED.split())
+_USUAL = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"})
+_ENDINGS = _USUAL | {".jpe", ".jfif", ".jp2", ".pgm", ".ppm", ".pnm"}
+"""Beside usual ones the others are masks or depths of the same pictures."""
 
 
 def sequence_files(folder: Path) -> list[Path]:
@@ -43,6 +44,7 @@ def sequence_files(folder: Path) -> list[Path]:
         files = [file for file in folder.iterdir() if names_picture(file) and file.is_file()]
     except OSError as error:
         raise UserError(f"source folder {str(folder)!r} cannot be read ({error.strerror})") from None
+    files = [file for file in files if file.suffix.lower() in _USUAL] or files
     times = [re.fullmatch(r"(.*?)([0-9]+)\.([0-9]+)", file.stem) for file in files]
     found = [(one[1], int(one[2]), one[3]) for one in times if one]
     least = min((len(fraction) for *_, fraction in found), default=0)
@@ -78,8 +80,8 @@ def _gaps(files: list[Path]) -> str:
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
-def _left_out(folder: Path) -> str:
-    found = [file for file in folder.glob("[!.]*") if file.is_file() and not names_picture(file)]
+def _left_out(folder: Path, shown: Iterable[Path]) -> str:
+    found = [file for file in {*folder.glob("[!.]*")}.difference(shown) if file.is_file()]
     counts = Counter(file.suffix.lower() or "without one" for file in found)
     said = ", ".join(f"{count} {ending}" for ending, count in sorted(counts.items()))
     return said and f"files are left out by their endings: {said}"
@@ -125,7 +127,7 @@ class FolderSource(Source):
         if settings.source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
         notes(_gaps(self._files))
-        notes(_left_out(self._place))
+        notes(_left_out(self._place, self._files))
         notes(_pages(shown))
         self.notes = notes.taken()
         self._first = first

@@ -20,7 +20,14 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_common.units import SECOND_NS
 from hvt_edge.source.contract import Notes
-from hvt_edge.source.decoding.container import DEMUX_OPTIONS, cause_of, choose_stream, decode, is_local
+from hvt_edge.source.decoding.container import (
+    DEMUX_OPTIONS,
+    cause_of,
+    choose_stream,
+    decode,
+    is_local,
+    is_picture_each,
+)
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 
@@ -152,7 +159,8 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
         try:
             decoded = decode(stream, packet)
         except av.error.FFmpegError:
-            decoded, damaged = [], None if damaged is None else damaged + 1
+            decoded = []
+            damaged = None if damaged is None else damaged + is_picture_each(stream)
         if any(frame.is_corrupt for frame in decoded):
             pictures.say("damaged pictures come, shown as the decoder has patched them")
         if decoded:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -55,6 +56,8 @@ again only within this time."""
 _MOST_HISTORY_FRAMES = 45
 _MOST_HISTORY_BYTES = 128 * 2**20
 
+_SURE_OF_SOURCE = 0.6
+"""An edge that is as sure of an object has seen it in its source, where that is finer than the base."""
 _LEAST_INSIDE = 0.5
 """Tracks are carried on for a while. A box of which more than half has left the picture shows nothing any more."""
 
@@ -123,7 +126,7 @@ class PerceptionCounts:
     outcomes: Counter[str] = field(default_factory=Counter)
     """The outcome of each object in the others."""
     view_trust: float | None = None
-    """Mean confidence of the detector's boxes; None where that tells nothing."""
+    """Of the detector in the view, 0…1 (`ViewTrust.mean`); None where nothing tells it."""
     view_unlike: bool = False
     """It is so low that the detector does not know the view."""
 
@@ -176,6 +179,7 @@ class Pipeline:
             gap_frames=gap_frames,
             emit=self._pending.append,
         )
+        self._finer = view.scale < 1
         self._detected_frame: int | None = None
         self._now = Progress()
         self._picture_ns = 0
@@ -412,11 +416,12 @@ class Pipeline:
             shown = self._parts.refiner.shown(fused.tracks, capture_ns=capture_ns, origins=fused.origins)
             if self._parts.guesses is not None:
                 self._parts.guesses.update(fused.tracks, shown.base_classes, step, scores=fused.means)
+            shown = self._doubting(shown)
             self._doubted = int(shown.doubted.sum())
             if self._detection is not None and capture_ns - self._due_ns > _LATE_NS:
                 looked_ns = self._due_ns
             self._tell()
-            self._emit(replace(self._inside(self._doubting(shown)), looked_ns=looked_ns))
+            self._emit(replace(self._inside(shown), looked_ns=looked_ns))
         self._tell()
 
     def _tell(self) -> None:
@@ -424,12 +429,12 @@ class Pipeline:
         while pending:
             event = pending.pop(0)
             if guesses is not None and isinstance(event, Refinement):
-                event = guesses.doubting(event, unlike=self.trust.unlike)
+                event = guesses.doubting(event, unlike=self.trust.unlike and self._parts.edge_alike)
             self._emit(event)
 
     def _doubting(self, shown: Overlay) -> Overlay:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. Tracks
-        # that the edge sees with another detector are not touched.
+        # that the edge sees with another detector, or well in a finer picture, are not touched.
         guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
         if guesses is None and not self.trust.unlike:
             return shown
@@ -439,8 +444,10 @@ class Pipeline:
             doubted = doubted | guesses.among(shown.track_ids) & ~firm
             vague = vague & ~guesses.agreed(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
         if self.trust.unlike:
-            ours = [self._parts.edge_alike or one == "base" for one in shown.origins]
-            doubted = doubted | np.array(ours, np.bool_) & ~firm
+            ours = np.array([one == "base" for one in shown.origins], np.bool_)
+            if self._parts.edge_alike:
+                ours = ours | (shown.confidences < (_SURE_OF_SOURCE if self._finer else math.inf))
+            doubted = doubted | ours & ~firm
             sure = np.zeros_like(sure)
         return replace(shown, doubted=doubted, sure=sure, vague=vague)
 

@@ -141,10 +141,11 @@ class SessionPerception:
         detector, reader = self._taken()
         names, edge_classes = unified_names(detector.class_names, info.class_names)
         vocabulary = Vocabulary(names, reader.class_names)
+        alike = info.class_names == detector.class_names
 
         def doubting(event: Event) -> None:
             if guesses is not None and isinstance(event, Refinement):
-                event = guesses.doubting(event, unlike=self._trust.unlike)
+                event = guesses.doubting(event, unlike=alike and self._trust.unlike)
             emit(event)
 
         stage = StillStage(

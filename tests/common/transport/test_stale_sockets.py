@@ -27,6 +27,7 @@ from programs.processes import eventually
 from programs.silent_tunnel import SilentTunnel
 
 PROBE_BYTES = 6
+SO_TIMESTAMPNS = 35
 
 pytestmark = pytest.mark.skipif(not TCP_TABLES[0].exists(), reason="needs the kernel's table")
 
@@ -73,6 +74,8 @@ def test_a_udp_listener_that_nobody_reads_has_failed(remedy: str) -> None:
                 deaf.sendto(b"one", (host, port))
             watch.check_listeners()
             assert len(failures.now) == (check >= 8)
+            stamps = deaf.getsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS)
+            assert not stamps, "Zenoh has no room for them: it would not know where a datagram came to"
         (failed,) = failures.now
         assert f"udp {host}:{port} is not read" in failed.reason
         assert failed.reason.endswith(remedy)

@@ -113,7 +113,11 @@ def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch, grabber, c
     with av.open(data, "w", format="matroska") as output:
         film = output.add_stream(codec, rate=25, options={"tune": "zerolatency", "g": "1000"})
         film.width, film.height, film.pix_fmt = 128, 64, "yuv420p"
-        packets = [one for _ in range(200) for one in film.encode(av.VideoFrame(128, 64, "yuv420p"))]
+        grey = np.full(
+            (96, 128), 128, np.uint8
+        )  # a new frame holds anything, which may come as a cut, with a keyframe
+        frames = (av.VideoFrame.from_ndarray(grey, format="yuv420p") for _ in range(200))
+        packets = [one for frame in frames for one in film.encode(frame)]
         output.mux(packets[1:])
     connection = av.open(io.BytesIO(data.getvalue()))
     monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)

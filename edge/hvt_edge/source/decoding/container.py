@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import re
 import time
 import weakref
 from collections.abc import Callable, Generator, Iterator
@@ -251,20 +252,21 @@ def decoded(
     timeline = stamps.timeline(stream)
     reading = _Reading(container, stream)
     before_s: Fraction | None = None
-    paused, lost = False, 0
+    lost, each_is_one = 0, is_picture_each(stream)
     segments = container.format.name == _IN_SEGMENTS
-    pause_s = max(1 if segments else LONG_STEP_S, 3 * stamps.period_s)
+    longest_s = max(Fraction(1 if segments else LONG_STEP_S), 3 * stamps.period_s)
     for frame in reading.frames():
-        for _ in range(0 if stamps.usable else reading.damaged - lost):
-            timeline.at(None)  # or all that follows would come too early
+        if each_is_one and not stamps.usable:
+            for _ in range(reading.damaged - lost):
+                timeline.at(None)  # or all that follows would come too early
         lost = reading.damaged
         stamp = frame.pts if stamps.ordered else frame.dts
         jumped = bool(timeline.jumps)
         at_s = timeline.at(_seconds(stamp, frame.time_base) if stamps.usable else None)
-        if not paused and before_s is not None and at_s - before_s > pause_s:
-            paused = True
-            pause = f"{float(at_s - before_s):.1f} s at {float(before_s):.1f} s"
-            why = "is a segment missing?" if segments else "as its time stamps say"
+        if before_s is not None and at_s - before_s > longest_s:
+            longest_s = at_s - before_s
+            pause = f"{float(longest_s):.1f} s at {float(before_s):.1f} s"
+            why = "as its time stamps say" + ", or a segment is missing" * segments
             _log.warning("%s: its picture stands for %s, %s", name, pause, why)
         before_s = at_s
         yield at_s, frame
@@ -343,9 +345,15 @@ class _Reading:
         said_s = duration_s(stream) if whole else None
         if said_s is not None and self.end_s is not None:
             missing_s = said_s - (self.end_s - self._begin_s)
-            if missing_s > 1 and missing_s > said_s / 50:
+            if missing_s > max(Fraction(1), said_s / 50) and not self._is_rounded():
                 return f"it is {float(missing_s):.1f} s shorter than its header says"
         return ""
+
+    def _is_rounded(self) -> bool:
+        # Whether it is an HLS playlist of the first versions, in which segments last whole seconds.
+        name = Path(self._container.name.removeprefix("file:"))
+        text = name.read_text(errors="replace") if name.suffix.lower() == _PLAYLIST and name.is_file() else ""
+        return bool(re.search(r"^#EXTINF:\d+,", text, re.MULTILINE))
 
     def _frames_there(self) -> int:
         if self._container.format.name != "avi":
@@ -360,9 +368,12 @@ class _Reading:
         joined = sum(kind == b"moov" for kind, _ in boxes) > 1
         if joined and not self._stream.frames:
             return "another recording is behind it, in fragments that FFmpeg takes for those of the first"
-        for before, later in pairwise([1, *(number for kind, number in boxes if kind == b"moof")]):
+        numbers = [number for kind, number in boxes if kind == b"moof"]
+        for before, later in pairwise(numbers):
             if later > before + 1 and not joined:
                 return f"its fragments are not in a row: number {later} follows {before}"
+        if numbers and numbers[0] > 2 and not joined:
+            return f"its first fragment is number {numbers[0]}: is its beginning missing?"
         ends = name in _WITHOUT_INDEX or joined
         behind = 1 - self._end_byte / size if size and ends else 0
         if behind > _MOST_BEHIND:
@@ -391,6 +402,11 @@ def packets_of(container: Any, stream: Any) -> Iterator[Any]:
         yield packet
 
 
+def is_picture_each(stream: Any) -> bool:
+    """Whether each packet is a picture: one of H.264 or HEVC may hold none, which FFmpeg calls damaged."""
+    return str(stream.codec_context.name) == "mjpeg"
+
+
 def decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
     """The pictures of a packet, of the stream's own codec; after an error those that the decoder has held back.
 
@@ -398,7 +414,7 @@ def decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
     """
     if isinstance(packet, Exception):
         return list(stream.codec_context.decode(None))
-    if stream.codec_context.name == "mjpeg" and _is_truncated(bytes(packet)):
+    if is_picture_each(stream) and _is_truncated(bytes(packet)):
         raise av.error.InvalidDataError(1, "it breaks off")
     return list(packet.decode())
 

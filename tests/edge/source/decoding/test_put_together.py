@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from fractions import Fraction
 
 import av
@@ -94,15 +95,21 @@ def test_fragments_of_another_recording_are_said(tmp_path, caplog):
     assert "both.mp4 is unfinished: another recording is behind it" in caplog.text
 
 
-@pytest.mark.parametrize("missing", [slice(2), slice(1, 2)])
-def test_a_fragment_that_is_missing_is_said(tmp_path, caplog, missing):
+@pytest.mark.parametrize(
+    ("missing", "says"),
+    [
+        (slice(2), "its first fragment is number 3: is its beginning missing?"),
+        (slice(1, 2), "its fragments are not in a row: number 3 follows 1"),
+    ],
+)
+def test_a_fragment_that_is_missing_is_said(tmp_path, caplog, missing, says):
     """The picture stood still, or began late, without a word, where an upload had lost a part."""
     write(tmp_path / "a.mp4", range(60), movflags="frag_keyframe+empty_moov+default_base_moof")
     head, *fragments = (tmp_path / "a.mp4").read_bytes().split(b"moof")
     del fragments[missing]
     (tmp_path / "a.mp4").write_bytes(b"moof".join([head, *fragments]))
     play(tmp_path / "a.mp4")
-    assert "a.mp4 is unfinished: its fragments are not in a row: number 3 follows 1" in caplog.text
+    assert f"a.mp4 is unfinished: {says}" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -114,6 +121,16 @@ def test_a_segment_that_is_missing_is_said(tmp_path, caplog, missing, says):
     (tmp_path / f"a{missing}.ts").unlink()
     play(tmp_path / "a.m3u8")
     assert says in caplog.text
+
+
+def test_a_playlist_of_whole_seconds_is_whole(tmp_path, caplog):
+    """Of segments of 1.6 s with sound each would be said to last 2: the film would be called unfinished."""
+    write(tmp_path / "a.m3u8", range(192), group=48, hls_time="1.6", hls_list_size="0")
+    text = (tmp_path / "a.m3u8").read_text()
+    assert "#EXTINF:1.6" in text
+    (tmp_path / "a.m3u8").write_text(re.sub(r"#EXTINF:1\.6\d*", "#EXTINF:2", text))
+    assert [number_of(one) for one in play(tmp_path / "a.m3u8")] == list(range(192))
+    assert "unfinished" not in caplog.text
 
 
 def test_another_codec_in_the_midst_is_not_called_damage_alone(tmp_path, caplog):
