@@ -26,7 +26,7 @@ _LEAST_PICTURES = 5
 """The first of a flight are coded coarsely, and their boxes weak."""
 _BEFORE = 0.6
 """As if each picture had one more box of this confidence: few boxes must be weaker to tell of an unknown view."""
-_UNLIKE_BELOW, _LIKE_FROM = 0.48, 0.51
+_UNLIKE_BELOW, _LIKE_FROM = 0.48, 0.5
 """Vehicles of 40 pixels aslant, of which it finds none, have .37; views that it knows .5 to .8."""
 
 
