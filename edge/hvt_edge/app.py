@@ -32,7 +32,7 @@ from hvt_edge.report.state import Heartbeat, lacks
 from hvt_edge.report.status import status_text, summary
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
-from hvt_edge.source.live import SOURCE_PART, closing_on
+from hvt_edge.source.live import SOURCE_PART
 from hvt_edge.wiring import (
     Flight,
     Stages,
@@ -179,11 +179,7 @@ class Edge:
         next_status_ns = restarts = 0
         heartbeat = stages.heartbeat
         self._counts.begin(source)
-        with ExitStack() as stack:
-            if source.live:
-                stack.enter_context(closing_on(self._stop, source))
-            pace = self._make_pace(source, stages, link)
-            stack.enter_context(pace)
+        with self._make_pace(source, stages, link) as pace:
             for frame in source.steps(start_ns=stages.link.operating.now.started_ns):
                 if self._stop.is_set():
                     break

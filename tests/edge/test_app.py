@@ -8,16 +8,20 @@ import time
 import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
 
 from hvt_common.errors import FlightError, UserError
 from hvt_common.inference.detect import Detector
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import Status
 from hvt_common.runtime.reporting import reported
 from hvt_common.values import Detections, Frame, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
+from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from media.pictures import write_scene
@@ -51,8 +55,12 @@ def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path)
     assert summary["frames_captured"] == FRAMES
 
 
+def _threads() -> set[threading.Thread]:
+    return set(threading.enumerate())
+
+
 def test_an_edge_that_hangs_is_reported(tmp_path):
-    """All that was counted would be lost with it, and the reason."""
+    """All that was counted would be lost with it, and the reason; and a small board has no memory for threads."""
     write_scene(tmp_path, frames=FRAMES)
     config = EdgeConfig(
         source=str(tmp_path), source_fps=FPS, fps=FPS, size="320x192", preset="ultrafast", method="M0",
@@ -71,10 +79,17 @@ def test_an_edge_that_hangs_is_reported(tmp_path):
 
     edge = Edge(check(config), stop=threading.Event(), world=HangingWorld())
     assert edge.given_up().summary is None, "nothing is known yet"
-    run = threading.Thread(target=edge.run)
+    run, before = threading.Thread(target=edge.run), _threads()
     run.start()
     try:
         assert hung.wait(60)
+        names = {one.name for one in _threads() - before - {run}}
+        assert {one for one in names if one.startswith("hvt-")} <= {
+            "hvt-link-watch",
+            "hvt-sockets",
+            "hvt-stills",
+        }
+        assert len(names) <= 6, "and one of Zenoh's for each channel that it answers on"
         summary = edge.given_up().summary
     finally:
         goes_on.set()
@@ -139,7 +154,24 @@ def test_a_wrong_endpoint_is_refused_before_a_model_is_opened(tmp_path):
 
 
 class TornWorld(World):
-    """Its source breaks off."""
+    """Its source breaks off; ``reports`` are its status messages."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reports: list[Status] = []
+
+    def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
+        """See there."""
+        link = super().open_link(stack, config)
+        put = link.put
+
+        def noted(channel: Channel, payload: bytes, **more) -> None:
+            if channel is Channel.STATUS:
+                self.reports.append(Status.parse(payload))
+            put(channel, payload, **more)
+
+        link.put = noted
+        return link
 
     def open_source(self, config: EdgeConfig) -> Source:
         """See there."""
@@ -158,10 +190,14 @@ def test_a_flight_that_breaks_off_is_reported_all_the_same(tmp_path, caplog):
         source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M0",
         connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0, pace="lockstep",
     )  # fmt: skip
-    told = []
+    told, world = [], TornWorld()
     with pytest.raises(FlightError, match="it is torn"):
-        reported(Edge(check(config), stop=threading.Event(), world=TornWorld()).run, told.append)
+        reported(Edge(check(config), stop=threading.Event(), world=world).run, told.append)
     (summary,) = told
+    last = world.reports[-1]
+    assert (last.state, [one.reason for one in last.failed]) == ("ended", ["it is torn"]), (
+        "the ground is told"
+    )
     assert summary["frames"] == 6
     assert [(one["part"], one["reason"]) for one in summary["failed"]] == [("flight", "it is torn")]
     assert "all else goes on" not in caplog.text

@@ -87,7 +87,7 @@ def ended_in_time(
     ``in_hand()`` has the turns of parts that have begun and not ended: one that is there 9 s later hangs. The main
     thread is left to signals: one that is in a native library heeds none.
     """
-    done = _in_thread(run, name="hvt-run")
+    done = in_thread(run, name="hvt-run", lowered=False)
     while not wait([done], timeout=_CHECK_EVERY_S).done and not stop.is_set():
         pass
     before = in_hand()
@@ -178,20 +178,13 @@ def put_video_first() -> None:
     cv2.setNumThreads(1)
 
 
-def in_thread(call: Callable[[], T], *, name: str) -> Future[T]:
+def in_thread(call: Callable[[], T], *, name: str, lowered: bool = True) -> Future[T]:
     """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too."""
-
-    def lowered() -> T:
-        lower_priority()
-        return call()
-
-    return _in_thread(lowered, name=name)
-
-
-def _in_thread(call: Callable[[], T], *, name: str) -> Future[T]:
     done: Future[T] = Future()
 
     def run() -> None:
+        if lowered:
+            lower_priority()
         try:
             done.set_result(call())
         except BaseException as error:  # noqa: BLE001 - raised where it is waited for

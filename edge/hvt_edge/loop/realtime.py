@@ -102,6 +102,7 @@ class RealtimePace:
 
         ``missed`` counts frames of a live source that this loop did not take in time. ``frame`` None: none has come.
         """
+        self._worker.serve_requested()
         if frame is None:
             self.before_frame(self.clock())
             return

@@ -9,7 +9,6 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 JOIN_S = 1.5
-IDLE_S = 1.0
+IDLE_S = 0.25
 LEAST_PATIENCE_S, _MOST_PATIENCE_S = 2.0, 10.0
 _MOST_PENDING = 8
 """Most frames of a burst that are held."""
@@ -236,21 +235,6 @@ class LiveSource(Source):
 def _reason(error: Exception) -> str:
     # A driver or a decoder may raise any error.
     return str(error) if isinstance(error, SignalLost | UserError) else reason_of(error)
-
-
-@contextmanager
-def closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
-    """Close a live source as soon as ``stop`` is set: a source without signal would keep its reader waiting."""
-
-    def wait() -> None:
-        stop.wait()
-        source.close()
-
-    threading.Thread(target=wait, name="hvt-stop", daemon=True).start()
-    try:
-        yield
-    finally:
-        stop.set()
 
 
 _MOST_DELAY_NS = 5 * SECOND_NS

@@ -10,12 +10,13 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.errors import foreign
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures, RetryPause, Turns
-from hvt_common.runtime.process import lower_priority
+from hvt_common.runtime.process import in_thread, lower_priority
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.perception.shadow import Detected
 from hvt_edge.stills.stage import StillStage
@@ -72,8 +73,8 @@ class StillWorker:
     ``results()`` of stills, and detections by ``detected()``. An error in it stops stills and perception
     for a while, never the video: queued frames are given up, and the stage goes on from a keyframe.
 
-    The other thread has no queue, and not the lower priority: it codes and sends requested stills while a detection,
-    a decision or an automatic still takes its time.
+    The other thread has not the lower priority: it codes and sends requested stills while a detection, a decision
+    or an automatic still takes its time, and ends with the last of them.
     """
 
     stage: StillStage
@@ -97,9 +98,8 @@ class StillWorker:
         self._skipped = SkippedUnits()
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-stills", daemon=True)
-        self._requested = threading.Thread(target=self._run_requested, name="hvt-requested", daemon=True)
+        self._requested: Future[None] | None = None
         self._thread.start()
-        self._requested.start()
 
     @property
     def queued(self) -> int:
@@ -132,8 +132,14 @@ class StillWorker:
         self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
         self._given_up.set()
         until_s = time.monotonic() + self.finish_s
-        for thread in (self._thread, self._requested):
-            thread.join(timeout=max(0.0, until_s - time.monotonic()))
+        self._thread.join(timeout=self.finish_s)
+        wait(filter(None, [self._requested]), timeout=max(0.0, until_s - time.monotonic()))
+
+    def serve_requested(self) -> None:
+        """Have requested stills coded and sent, where any wait; call it often, in a thread of full priority."""
+        if self.stage.outbox.on_demand is not None and (self._requested is None or self._requested.done()):
+            with contextlib.suppress(RuntimeError):  # no thread is to be had now
+                self._requested = in_thread(self._run_requested, name="hvt-requested", lowered=False)
 
     def _run(self) -> None:
         lower_priority()
@@ -153,15 +159,15 @@ class StillWorker:
 
     def _run_requested(self) -> None:
         turns = Turns(_REQUESTED_PART, self.failures, clock=self.clock)
-        while not self._given_up.wait(_RETRY_S):
+        while self.stage.outbox.on_demand is not None and not self._given_up.is_set():
             try:
-                if self.stage.outbox.on_demand is not None:
-                    with turns:
-                        self.stage.send_requested(now_ns=self.clock())
-                    self.failures.works(_REQUESTED_PART)
+                with turns:
+                    self.stage.send_requested(now_ns=self.clock())
+                self.failures.works(_REQUESTED_PART)
             except foreign() as error:  # it ends one requested still, never the flight
                 self.failures.failed(_REQUESTED_PART, f"one was not sent ({type(error).__name__}: {error})")
                 self._given_up.wait(_FAILED_S)
+            self._given_up.wait(_RETRY_S)
 
     def _fail(self, error: BaseException) -> None:
         with self._lock:

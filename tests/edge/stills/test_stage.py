@@ -251,6 +251,7 @@ def requested_beside(rig: Rig, blocking: Blocking) -> None:
         worker.take(FRAMES[-1], None, late=True)
         _, frame_index = on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
         assert frame_index == FRAMES[-1].index, "what the camera sees now, which nobody has analyzed"
+        worker.serve_requested()
         eventually(lambda: len(rig.out.stills) > before, what="the requested still is there")
         assert not blocking.released.is_set()
         eventually(lambda: failing() == ["stills"], what="it is said that they hang")
