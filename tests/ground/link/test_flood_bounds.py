@@ -37,7 +37,7 @@ class Rig:
     """A session whose clock the test turns."""
 
     def __init__(self, flight: Flight) -> None:
-        self.events = Events()
+        self.flight, self.events = flight, Events()
         self.now_ns = 1_790_000_000 * SECOND_NS
         self.session = Session(
             flight.info(), sinks=[self.events], pipeline_of=pipeline_of, clock=lambda: self.now_ns
@@ -47,6 +47,20 @@ class Rig:
             header = BaseHeader.parse(item.attachment, item.payload)
             unit = Arrival("decode", header, item, item.received_ns, starts_run=index == 0)
             assert self.session.base(unit)
+
+    def notices(self) -> list[str]:
+        return [one.text for one in self.events if isinstance(one, Notice)]
+
+    def report(self, number: int, **changes) -> None:
+        """Take a report of the edge."""
+        item = self.flight.status(base=3)
+        status = Status.parse(item.payload)
+        self.session.take(replace(status, sequence=number, **changes), item)
+
+    def broken_stills(self, count: int) -> None:
+        for sequence in range(count):
+            item = self.flight.still(1, sequence, data=b"no picture")
+            self.session.take(RoiHeader.parse(item.attachment, item.payload), item)
 
     def step(self, item, **lies) -> int:
         """Take a report of tracks; how many there have been."""
@@ -62,57 +76,46 @@ def rig(flight):
     rig.session.close()
 
 
-def test_a_forged_status_number_does_not_silence_the_edge_for_good(rig, flight):
+def test_a_forged_status_number_does_not_silence_the_edge_for_good(rig):
     """The ground would never hear that the session has ended, nor what the edge has dropped."""
-    item = flight.status(base=3)
-    real = Status.parse(item.payload)
-    rig.session.take(replace(real, sequence=2**32 - 1), item)
+    rig.report(2**32 - 1)
     rig.now_ns += SECOND_NS
-    rig.session.take(replace(real, sequence=real.sequence + 1), item)
+    rig.report(1)
     assert rig.session.reception.last_status.sequence == 2**32 - 1, "late ones are left out as ever"
     rig.now_ns += 5 * SECOND_NS
-    rig.session.take(replace(real, sequence=real.sequence + 6, state="ended"), item)
+    rig.report(6, state="ended")
     assert rig.session.reception.last_status.state == "ended"
 
 
-def test_an_edge_that_reports_without_end_does_not_talk_to_all_viewers(rig, flight):
+def test_an_edge_that_reports_without_end_does_not_talk_to_all_viewers(rig):
     """Each line of its log goes to every viewer of every edge: nobody would see a picture any more."""
-    item = flight.status(base=3)
-    real = Status.parse(item.payload)
     for number in range(1, 2000):
         rig.now_ns += SECOND_NS // 1000
-        rig.session.take(replace(real, sequence=real.sequence + number, decisions=f"report {number}"), item)
+        rig.report(number, decisions=f"report {number}")
     rig.session.close()
-    said = [one.text for one in rig.events if isinstance(one, Notice)]
+    said = rig.notices()
     assert len([one for one in said if one.startswith("Report")]) == 61
     assert sum(int(one.split()[0]) for one in said if "left out" in one) == 1999 - 61
     assert said[-1].endswith("ended"), "how it ended is said in any case"
 
 
-def test_numbers_alone_are_no_event(rig, flight):
+def test_numbers_alone_are_no_event(rig):
     """The list of events would be a column of figures that change each second."""
-    item = flight.status(base=3)
-    real = Status.parse(item.payload)
     said = [
         "no tracks: not measured yet; stills: no answer yet",
-        ("no tracks: the video hides 2 objects, misnames 1; stills: they name 1 of 2 otherwise"),
+        "no tracks: the video hides 2 objects, misnames 1; stills: they name 1 of 2 otherwise",
         "tracks: the video hides 9 objects; stills: they name 1 of 2 otherwise",
         "tracks: the video hides 9 objects; stills paused: they name 1 of 40 otherwise",
         "tracks: the video hides 8 objects; stills paused: they name 1 of 40 otherwise",
     ]
-    for number, decisions in enumerate(said):
-        rig.session.take(replace(real, sequence=real.sequence + 1 + number, decisions=decisions), item)
+    for number, decisions in enumerate(said, 1):
+        rig.report(number, decisions=decisions)
     assert rig.session.reception.decisions == said[-1]
-    assert [one.text for one in rig.events if isinstance(one, Notice)] == [
+    tracks = "The edge sends its tracks: the video hides 9 objects. "
+    assert rig.notices() == [
         "The edge sends no tracks: not measured yet. Stills may be sent: the ground has judged none yet.",
-        (
-            "The edge sends its tracks: the video hides 9 objects. "
-            "Stills are sent: they name 1 of 2 otherwise."
-        ),
-        (
-            "The edge sends its tracks: the video hides 9 objects. "
-            "Stills are paused: they name 1 of 40 otherwise."
-        ),
+        tracks + "Stills are sent: they name 1 of 2 otherwise.",
+        tracks + "Stills are paused: they name 1 of 40 otherwise.",
     ]
 
 
@@ -130,21 +133,16 @@ def test_a_forged_step_number_does_not_end_the_tracks_for_good(rig, flight):
     assert [bool(at_ns) for at_ns in handled] == [True, True], "the tracks of both are known"
 
 
-def test_results_that_nobody_fetches_do_not_pile_up(rig, flight):
+def test_results_that_nobody_fetches_do_not_pile_up(rig):
     """Stills by the thousand would each leave an answer behind."""
-    for sequence in range(5000):
-        item = flight.still(1, sequence, data=b"no picture")
-        header = RoiHeader.parse(item.attachment, item.payload)
-        rig.session.take(header, item)
+    rig.broken_stills(5000)
     assert len(rig.session.reception.take_results(100_000)) <= 4096
     assert rig.session.stills_dropped["undecodable"] > 4900
 
 
-def test_broken_stills_are_not_all_looked_into(rig, flight):
+def test_broken_stills_are_not_all_looked_into(rig):
     """Each costs a line in the recording and one on stderr; a few thousand a second would fill both."""
-    for sequence in range(200):
-        item = flight.still(1, sequence, data=b"no picture")
-        rig.session.take(RoiHeader.parse(item.attachment, item.payload), item)
+    rig.broken_stills(200)
     rig.session.close()
     assert sum("is damaged" in getattr(one, "text", "") for one in rig.events) == 32
 

@@ -21,19 +21,16 @@ S = 1_000_000_000
 
 
 def begun(**changes) -> Reception:
-    """A session of which nothing has come."""
     info = replace(INFO, **changes)
     return Reception(info, clock=lambda: 0, edge_clock=ClockOffset(), emit=lambda _event: None)
 
 
 def report(reception: Reception, now_ns: int) -> Feedback:
-    """What the edge is told."""
     others = {"receiver_id": 1, "sequence": 0, "clock_offset_ns": 0, "clock_error_ns": -1, "backlog": ()}
     return reception.feedback(send_ns=now_ns, **others)
 
 
 def header(sequence: int) -> BaseHeader:
-    """Of a base message."""
     return BaseHeader(
         session_id=7, sequence=sequence, frame_index=sequence, capture_ns=0, send_delay_ns=0, flags=0
     )
@@ -46,7 +43,6 @@ def base(reception: Reception, sequence: int, *, arrived_ns: int, size_bytes=500
 
 
 def still(reception: Reception, sequence: int, *, arrived_ns: int) -> None:
-    """A still comes."""
     reception.still(replace(ROI, sequence=sequence), message("roi", 900, arrived_ns))
 
 
@@ -57,7 +53,6 @@ def chunk(reception: Reception, *, arrived_ns: int, still: int | None = None) ->
 
 
 def message(channel: str, size_bytes: int, arrived_ns: int) -> Received:
-    """So many bytes."""
     return Received(f"hvt/uav-1/{channel}", bytes(size_bytes), b"", "", arrived_ns)
 
 
@@ -115,25 +110,15 @@ def test_reports_take_a_small_share_of_the_way_back(rate_bps, least_s, most_s):
     assert len(later) >= 12
 
 
-def test_without_news_reports_are_rare():
-    """A paused edge would hear ten reports a second that say nothing."""
-    reception = begun()
+@pytest.mark.parametrize("pace", ["realtime", "lockstep"])
+def test_without_news_and_in_lockstep_reports_are_rare(pace):
+    """An edge would hear ten reports a second that say nothing, or that it has no use for."""
+    reception = begun(pace=pace)
     base(reception, 0, size_bytes=100_000, arrived_ns=0)
     report(reception, 0)
-    assert not reception.due(400 * MS)
-    assert reception.due(500 * MS)
+    assert [reception.due(ms * MS) for ms in (400, 500)] == [False, True]
     base(reception, 1, size_bytes=100_000, arrived_ns=100 * MS)
-    assert reception.due(101 * MS)
-
-
-def test_lockstep_reports_do_not_hang_on_the_clock_of_arrival():
-    """More reports would be sent than an edge in lockstep has use for."""
-    reception = begun(pace="lockstep")
-    report(reception, 0)
-    for sequence in range(6):
-        base(reception, sequence, size_bytes=50_000, arrived_ns=sequence * 10 * MS)
-    assert not reception.due(400 * MS)
-    assert reception.due(500 * MS)
+    assert reception.due(101 * MS) == (pace == "realtime")
 
 
 def test_memory_is_bounded():
@@ -145,25 +130,6 @@ def test_memory_is_bounded():
         if sequence % 5000 == 4999:
             sizes.append(footprint_bytes(reception))
     assert sizes[-1] < 1.1 * sizes[0]
-
-
-def missing(reception: Reception, *, now_s: float = 1.0) -> tuple[int, ...]:
-    """What a report would name."""
-    return report(reception, round(now_s * S)).missing_stills
-
-
-def test_stills_that_never_came_are_named_until_they_come():
-    """The edge would take them for received, and never send them again."""
-    reception = begun()
-    base(reception, 0, arrived_ns=0)
-    still(reception, 1, arrived_ns=S // 2)
-    still(reception, 4, arrived_ns=S)
-    assert missing(reception) == (0, 2, 3)
-    still(reception, 2, arrived_ns=S)
-    still(reception, 2, arrived_ns=S)
-    assert missing(reception) == (0, 3)
-    assert missing(reception, now_s=6.9) == (3,)
-    assert missing(reception, now_s=7.1) == ()
 
 
 def test_a_still_that_comes_with_what_was_kept_is_missed_no_more():
@@ -187,41 +153,56 @@ def test_pieces_of_the_past_are_reported_on_as_often_as_anything():
     assert reception.due(S + 150 * MS)
 
 
-def test_a_ground_that_joins_late_misses_nothing_of_before():
-    """It would ask for stills of a past that nobody there has seen, on the thin link."""
+LAST = 2**32 - 1
+
+
+@pytest.mark.parametrize(
+    ("first", "comes"),
+    [
+        pytest.param(
+            0,
+            [
+                (0.5, (1,), 0.5, 1, (0,)),
+                (1, (4,), 1, 4, (0, 2, 3)),
+                (1, (2, 2), 1, 4, (0, 3)),
+                (1, (), 6.9, 4, (3,)),
+                (1, (), 7.1, 4, ()),
+            ],
+            id="the edge would take them for received, and never send them again",
+        ),
+        pytest.param(
+            700,
+            [(0, (90,), 1, 90, ()), (0, (92,), 1, 92, (91,))],
+            id="a ground that joins late would ask for stills of a past that nobody there has seen",
+        ),
+        pytest.param(
+            0,
+            [
+                (0, (LAST - 1,), 1, LAST - 1, tuple(range(LAST - 1 - MAX_MISSING_STILLS, LAST - 1))),
+                (0, (LAST,), 1, LAST, tuple(range(LAST - 1 - MAX_MISSING_STILLS, LAST - 1))),
+            ],
+            id="a forged number would make reports too long to be sent, or the ground grow",
+        ),
+        pytest.param(
+            0,
+            [
+                (0, (0, 1, 4, LAST - 8, 5, 2), 1, 5, (3,)),
+                (1, (LAST - 7, LAST - 6), 1, LAST - 6, ()),  # two that follow each other are believed
+                (2, (6, 8), 2, 8, ()),
+            ],
+            id="reports would name for ever what the edge never sent",
+        ),
+    ],
+)
+def test_stills_that_never_came_are_named_until_they_come(first, comes):
+    """Named after what would be lost. At a time come stills; a report at another says the newest and the missing."""
     reception = begun()
-    base(reception, 700, arrived_ns=0)
-    still(reception, 90, arrived_ns=0)
-    assert missing(reception) == ()
-    still(reception, 92, arrived_ns=0)
-    assert missing(reception) == (91,)
-
-
-def test_what_is_missing_is_bounded():
-    """A forged number would make reports too long to be sent, or the ground grow."""
-    reception = begun()
-    base(reception, 0, arrived_ns=0)
-    still(reception, 2**32 - 2, arrived_ns=0)
-    assert missing(reception) == tuple(range(2**32 - 2 - MAX_MISSING_STILLS, 2**32 - 2))
-    still(reception, 2**32 - 1, arrived_ns=0)
-    assert len(missing(reception)) == MAX_MISSING_STILLS
-
-
-def test_a_forged_number_of_a_still_hides_no_true_one():
-    """Reports would name for ever what the edge never sent: it would take none of its stills for received."""
-    reception = begun()
-    base(reception, 0, arrived_ns=0)
-    for sequence in (0, 1, 4, 2**32 - 9, 5, 2):
-        still(reception, sequence, arrived_ns=0)
-    measured = report(reception, S)
-    assert (measured.still_sequence, measured.missing_stills) == (5, (3,))
-    for sequence in (2**32 - 8, 2**32 - 7):  # two that follow each other are believed, as after a long hole
-        still(reception, sequence, arrived_ns=S)
-    assert report(reception, S).still_sequence == 2**32 - 7
-    for sequence in (6, 8):
-        still(reception, sequence, arrived_ns=2 * S)
-    measured = report(reception, 2 * S)
-    assert (measured.still_sequence, measured.missing_stills) == (8, ())
+    base(reception, first, arrived_ns=0)
+    for at_s, stills, reported_s, newest, missing in comes:
+        for sequence in stills:
+            still(reception, sequence, arrived_ns=round(at_s * S))
+        measured = report(reception, round(reported_s * S))
+        assert (measured.still_sequence, measured.missing_stills) == (newest, missing)
 
 
 class Progress(int):
@@ -232,11 +213,7 @@ class Progress(int):
 
     def __sub__(self, other):
         sequence = 100 + 2 * len(self.threads)
-        came = threading.Thread(
-            target=still,
-            args=(self.reception, sequence),
-            kwargs={"arrived_ns": S},
-        )
+        came = threading.Thread(target=still, args=(self.reception, sequence), kwargs={"arrived_ns": S})
         came.start()
         came.join(0.1)  # it has to wait its turn
         self.threads.append(came)
@@ -287,9 +264,6 @@ def test_a_time_of_the_future_does_not_stop_the_measurement():
     assert due == [True, False, True, True, True, False, True]
 
 
-# Capture times by the ground's clock.
-
-
 YEAR_NS = 365 * 86_400 * SECOND_NS
 
 
@@ -313,9 +287,6 @@ def test_a_clock_that_becomes_right_counts_again() -> None:
     clock.note(YEAR_NS + SECOND_NS, received_ns=2 * SECOND_NS)
     assert clock.is_sound
     assert clock.to_local_ns(YEAR_NS + SECOND_NS) == SECOND_NS
-
-
-# Silence, as a thread sees it that is kept from its messages now and then.
 
 
 def test_gaps_count_as_far_as_both_arrival_and_handling_show_them():
@@ -343,9 +314,7 @@ def test_gaps_count_as_far_as_both_arrival_and_handling_show_them():
 def test_it_never_goes_back():
     """Callbacks of two threads may come the wrong way round, and a keyframe would never be asked for again."""
     time = Uptime()
-    shown = [
-        time.handle(arrived_ns=arrived, now_ns=now)
-        for arrived, now in ((50, 50), (40, 60), (90, 80), (85, 95))
-    ]
+    came = ((50, 50), (40, 60), (90, 80), (85, 95))
+    shown = [time.handle(arrived_ns=arrived, now_ns=now) for arrived, now in came]
     assert shown == sorted(shown)
     assert shown[-1] <= 95
