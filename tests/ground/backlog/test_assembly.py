@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from hvt_common.protocol.messages import (
     MAX_BACKLOG_BYTES,
-    AcknowledgedRange,
     BacklogHeader,
     BacklogStill,
     Flags,
@@ -33,98 +32,88 @@ def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=
     )
 
 
-def acknowledged_range(number: int, acknowledged_bytes: int, *, kind="still", session=7) -> AcknowledgedRange:
-    """What the edge hears."""
-    return AcknowledgedRange(
-        session_id=session, kind=kind, number=number, acknowledged_bytes=acknowledged_bytes
-    )
+MOST, HALF = MAX_BACKLOG_BYTES, MAX_BACKLOG_BYTES // 2
+ZEROS = bytes(MOST)
+LARGEST = {"max_objects": 3, "max_bytes": MOST}
+STORIES = {
+    "nothing of an outage would ever be seen, or the edge would send it for ever": """
+        3 0-4; heard 3=4; 3 4-10: whole; heard 3=9; settle 3 used; heard 3=10; objects 0; bytes 0""",
+    "of a still that a slow ground has not read yet an edge would hear that it may forget it": f"""
+        3 0-10: whole; {100 * "3 9-10; heard 3=9;"} 3 0-9/9; heard 3=0; settle 3 used; heard 3=10""",
+    "an object that begins again after a session has ended would lose what has come of it": """
+        3 0-10: whole; drop 1; 3 0-6; settle 3 used; settle 3 untaken; 3 6-10: whole; settle 3 untaken;
+        objects 0; heard""",
+    "an object with a hole in it would be taken for a whole one": """
+        3 0-3; 3 6-8; heard 3=3; 3 1-5; 3 0-2; heard 3=5; 3 2-10: whole""",
+    "two halves of two objects would be one": """
+        3 0-6; 3 6-8/12; heard 3=0; 3 0-12/12: whole""",
+    "one bad object would take the link for the rest of the flight": f"""
+        {2 * "3 0-10: whole; settle 3 unusable; heard 3=0;"} 3 0-10: whole; settle 3 unusable; heard 3=10""",
+    "while much waits, or a session is not known, an object would be acknowledged and lost": """
+        3 0-4 busy; 3 4-10 busy; want; heard 3=4 info0=0; 3 4-10: whole; drop 1; settle 3 used; heard 3=0;
+        3 4-10; heard 3=0""",
+    "a ground that has forgotten the facts of a session would ask for ever": f"""
+        {2 * "info0 0-10: whole; settle info0 used; heard info0=10;"} objects 0""",
+    "objects that never end would fill the ground's memory, or keep out all others": (
+        LARGEST,
+        f"""0 0-2; 1 0-2; 2 0-2; 3 0-2; 4 0-2; objects 3; heard 0=2 1=2 2=2 3=2 4=2; 0 2-4; heard 0=0;
+        4 2-10: whole; 9 0-{MOST}/{MOST}; settle 4 used; 9 0-{MOST}/{MOST}: whole; bytes {MOST}""",
+    ),
+    "where a report is lost the still would be in the gallery twice, or sent until the store is full": (
+        {"remember": 3},
+        "".join(f"{n} 0-10: whole; {n} 0-10; settle {n} used;" for n in range(5))
+        + """heard 0=10 1=10 2=10 3=10 4=10; 4 0-10; 3 3-5; heard 4=10 3=10; 4 0-9/9: whole; 0 0-10: whole""",
+    ),
+    "the bound would be there, and one object more would go beyond it": (
+        {"max_bytes": MOST + 10},
+        f"""3 0-{HALF}/{HALF}: whole; 4 0-{HALF + 10}/{HALF + 20}; bytes {MOST + 10};
+        4 {HALF + 10}-{HALF + 11}/{HALF + 20}; heard 3={HALF - 1} 4={HALF + 10}; 5 0-10: whole;
+        bytes {HALF + 10}""",
+    ),
+}
 
 
-KEY = (7, "still", 3)
-TEN = b"0123456789"
+def key_of(name: str) -> tuple[int, str, int]:
+    """Of the still ``3``, or of ``info0``."""
+    return (7, "info", 0) if name == "info0" else (7, "still", int(name))
 
 
-def test_pieces_in_order_become_the_object():
-    """Nothing of an outage would ever be seen, or the edge would send it for ever."""
-    assembly = BacklogAssembly()
-    assert assembly.chunk(header(), TEN[:4]) is None
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 4),)
-    assert assembly.chunk(header(4), TEN[4:]) == TEN
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 9),), (
-        "it is not where it belongs yet"
-    )
-    assembly.settle(KEY, usable=True)
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 10),)
-    assert (assembly.in_progress, assembly.size_bytes) == (0, 0)
+def do(assembly: BacklogAssembly, step: str, expected: str) -> None:
+    word, *options = step.split()
+    match word:
+        case "heard":
+            taken = assembly.take_acknowledged_ranges(16)
+            said = ["info0" if one.kind == "info" else str(one.number) for one in taken]
+            heard = [f"{name}={one.acknowledged_bytes}" for name, one in zip(said, taken, strict=True)]
+            assert heard == options
+        case "settle":
+            usable = {"used": True, "unusable": False, "untaken": None}[options[1]]
+            assembly.settle(key_of(options[0]), usable=usable)
+        case "drop":
+            assert assembly.drop_handed() == int(options[0])
+        case "want":
+            assembly.want_info(7)
+        case "objects" | "bytes":
+            assert (assembly.in_progress if word == "objects" else assembly.size_bytes) == int(options[0])
+        case _:
+            span, _, total = options[0].partition("/")
+            begin, end = map(int, span.split("-"))
+            _, kind, number = key_of(word)
+            size = int(total or 10)
+            content = b"0123456789xy"[:size] if size < 20 else ZEROS[:size]
+            of = header(begin, size, kind=kind, number=number)
+            whole = assembly.chunk(of, content[begin:end], may_finish="busy" not in options)
+            assert whole == (content if expected else None)
 
 
-def test_an_object_is_acknowledged_when_it_is_settled_however_long_that_takes():
-    """The edge forgets what it hears of: on a slow ground, a still that nobody has read is lost with the session."""
-    assembly = BacklogAssembly()
-    assert assembly.chunk(header(), TEN) == TEN
-    for _ in range(100):  # the edge asks every two seconds, with the last byte
-        assert assembly.chunk(header(9), TEN[9:]) is None
-        assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 9),), (
-            "somebody is there, and has it all but finished"
-        )
-    assert assembly.chunk(header(total=9), TEN[:9]) is None
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),), (
-        "another one of the same name has to wait"
-    )
-    assembly.settle(KEY, usable=True)
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 10),)
-
-
-def test_what_is_in_progress_is_not_settled_by_a_word_too_late():
-    """An object that begins again after a session has ended would lose what has come of it."""
-    assembly = BacklogAssembly()
-    assembly.chunk(header(), TEN)
-    assert assembly.drop_handed() == 1
-    assembly.chunk(header(), TEN[:6])
-    assembly.settle(KEY, usable=True)
-    assembly.settle(KEY, usable=None)
-    assert assembly.chunk(header(6), TEN[6:]) == TEN
-    assembly.settle(KEY, usable=None)
-    assert (assembly.in_progress, assembly.take_acknowledged_ranges(16)) == (0, ()), (
-        "nobody can take it: nothing is said of it"
-    )
-
-
-def test_only_the_run_without_a_hole_is_held():
-    """An object with a hole in it would be taken for a whole one."""
-    assembly = BacklogAssembly()
-    assembly.chunk(header(), TEN[:3])
-    assembly.chunk(header(6), TEN[6:8])
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 3),)
-    assembly.chunk(header(1), TEN[1:5])  # it overlaps and goes on
-    assembly.chunk(header(0), TEN[:2])  # old
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 5),)
-    assert assembly.chunk(header(2), TEN[2:]) == TEN
-
-
-def test_what_was_delivered_is_acknowledged_again_and_not_delivered_again():
-    """Where a report is lost the still would be in the gallery twice, or sent until the store is full."""
-    assembly = BacklogAssembly(remember=3)
-    for number in range(5):
-        assert assembly.chunk(header(number=number), TEN) == TEN
-        assert assembly.chunk(header(number=number), TEN) is None, "it is being worked on"
-        assembly.settle((7, "still", number), usable=True)
-    assert len(assembly.take_acknowledged_ranges(3)) == 3
-    assembly.take_acknowledged_ranges(16)
-    assert assembly.chunk(header(number=4), TEN) is None
-    assert assembly.chunk(header(3, number=3), TEN[3:5]) is None
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(4, 10), acknowledged_range(3, 10))
-    assert assembly.chunk(header(total=9, number=4), TEN[:9]) == TEN[:9], "another one of the same name"
-    assert assembly.chunk(header(number=0), TEN) == TEN, "what is known again is bounded"
-
-
-def test_another_size_begins_anew():
-    """Two halves of two objects would be one."""
-    assembly = BacklogAssembly()
-    assembly.chunk(header(), TEN[:6])
-    assembly.chunk(header(6, 12), b"xy")
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
-    assert assembly.chunk(header(0, 12), TEN + b"xy") == TEN + b"xy"
+@pytest.mark.parametrize("story", STORIES.values(), ids=STORIES)
+def test_what_was_stored_comes_across_once_and_within_bounds(story):
+    """Each is named after what would be lost. ``3 0-4``: these bytes of the still 3 come, of 10."""
+    bounds, steps = ({}, story) if isinstance(story, str) else story
+    assembly = BacklogAssembly(**bounds)
+    for step in filter(str.strip, steps.split(";")):
+        does, _, expected = step.partition(":")
+        do(assembly, does, expected)
 
 
 @pytest.mark.parametrize(
@@ -144,64 +133,7 @@ def test_a_piece_that_cannot_be_one_is_refused(offset, total, payload, kind, num
     assert (assembly.in_progress, assembly.take_acknowledged_ranges(16)) == (0, ())
 
 
-def test_an_unusable_object_is_asked_for_again_but_not_for_ever():
-    """One bad object would take the link for the rest of the flight."""
-    assembly = BacklogAssembly()
-    for _ in range(2):
-        assert assembly.chunk(header(), TEN) == TEN
-        assembly.settle(KEY, usable=False)
-        assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
-    assert assembly.chunk(header(), TEN) == TEN
-    assembly.settle(KEY, usable=False)
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 10),)
-
-
-def test_what_cannot_be_taken_now_comes_again():
-    """While much waits, or a session is not known, an object would be acknowledged and lost."""
-    assembly = BacklogAssembly()
-    assembly.chunk(header(), TEN[:4], may_finish=False)
-    assert assembly.chunk(header(4), TEN[4:], may_finish=False) is None
-    assembly.want_info(7)
-    assert assembly.take_acknowledged_ranges(16) == (
-        acknowledged_range(3, 4),
-        acknowledged_range(0, 0, kind="info"),
-    )
-    assert assembly.chunk(header(4), TEN[4:]) == TEN
-    assembly.drop_handed()  # the session that had it is gone
-    assembly.settle(KEY, usable=True)
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
-    assembly.chunk(header(4), TEN[4:])
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
-
-
-def test_facts_of_a_session_are_delivered_as_often_as_they_come():
-    """A ground that has forgotten them would ask for ever, and hear that it has them."""
-    assembly = BacklogAssembly()
-    for _ in range(2):
-        assert assembly.chunk(header(kind="info", number=0), TEN) == TEN
-        assembly.settle((7, "info", 0), usable=True)
-        assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(0, 10, kind="info"),)
-
-
-def test_a_full_assembly_gives_up_what_has_waited_longest():
-    """Objects that never end would fill the ground's memory, or keep out all others."""
-    assembly = BacklogAssembly(max_objects=3, max_bytes=MAX_BACKLOG_BYTES)
-    for number in range(5):
-        assembly.chunk(header(number=number), TEN[:2])
-    assert assembly.in_progress == 3
-    assert len(assembly.take_acknowledged_ranges(16)) == 5
-    assembly.chunk(header(2, number=0), TEN[2:4])
-    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(0, 0),)
-    assert assembly.chunk(header(2, number=4), TEN[2:]) == TEN
-    big = bytes(MAX_BACKLOG_BYTES)
-    assert assembly.chunk(header(total=MAX_BACKLOG_BYTES, number=9), big) is None, "one is being worked on"
-    assembly.settle((7, "still", 4), usable=True)
-    assert assembly.chunk(header(total=MAX_BACKLOG_BYTES, number=9), big) == big
-    assert assembly.size_bytes <= MAX_BACKLOG_BYTES
-
-
 QUARTER = MAX_BACKLOG_BYTES // 4
-ZEROS = bytes(MAX_BACKLOG_BYTES)
 chunk_of = st.tuples(
     st.integers(0, 5),  # number
     st.sampled_from([None, None, None, 0, 1, 2, 3]),  # where it begins, quarters; None goes on
@@ -246,30 +178,12 @@ def test_acknowledgements_that_nobody_fetches_are_bounded():
     """While the way back is away, memory would follow what comes."""
     assembly = BacklogAssembly()
     for number in range(2000):
-        assembly.chunk(header(number=number), TEN[:3])
+        assembly.chunk(header(number=number), b"012")
     said = 0
     while taken := assembly.take_acknowledged_ranges(16):
         assert len(taken) <= 16
         said += len(taken)
     assert said == 512
-
-
-def test_no_more_than_the_bound_is_held_to_the_byte():
-    """The bound would be there, and one object more would go beyond it."""
-    assembly = BacklogAssembly(max_bytes=MAX_BACKLOG_BYTES + 10)
-    half = MAX_BACKLOG_BYTES // 2
-    assert len(assembly.chunk(header(total=half), ZEROS[:half])) == half, (
-        "handed out: it takes its bytes still"
-    )
-    assert assembly.chunk(header(total=half + 20, number=4), ZEROS[: half + 10]) is None
-    assert assembly.size_bytes == MAX_BACKLOG_BYTES + 10
-    assert assembly.chunk(header(half + 10, half + 20, number=4), ZEROS[:1]) is None
-    assert assembly.take_acknowledged_ranges(16) == (
-        acknowledged_range(3, half - 1),
-        acknowledged_range(4, half + 10),
-    ), "no byte more"
-    assembly.chunk(header(number=5), TEN)  # what waits gives way, what is worked on does not
-    assert assembly.size_bytes == half + 10
 
 
 @given(
@@ -295,9 +209,6 @@ def test_an_edge_that_follows_the_acknowledgements_gets_everything_across(data, 
         for said in assembly.take_acknowledged_ranges(16):
             at = said.acknowledged_bytes
     assert whole == data
-
-
-# What is in an object
 
 
 @pytest.fixture(scope="module")
@@ -348,9 +259,6 @@ def test_any_bytes_are_refused_or_read(data, kind):
     """One hostile object would end the ground."""
     with pytest.raises(WireError):
         backlog_content((7, kind, 0), data, edge="uav-1")
-
-
-# What has been
 
 
 @given(numbers=st.lists(st.integers(0, 20_000), max_size=80))

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import itertools
+import os
 import threading
 import time
+from collections.abc import Callable
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_ground.backlog.edge_backlog import BacklogRecording, BacklogRecordings
 from hvt_ground.backlog.session_backlog import SessionBacklog, read_still, show_video
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job
 from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks.line_file import LineFile
 from hvt_ground.sinks.queued import SinkWriter
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
@@ -23,10 +29,14 @@ from rigs.examples import refinement
 from rigs.flight import Flight, StoredPerception, patient_worker
 
 
+def units_of(flight: Flight, count: int) -> tuple[BacklogUnit, ...]:
+    return parse_backlog_units(video_object(flight, range(count)))
+
+
 def test_work_that_was_never_begun_lets_its_recording_go():
     """The recording of a former session would stay open for ever, and with each such session one more."""
     flight = Flight(30, keyframes=(10,))
-    info, units = flight.info(), parse_backlog_units(video_object(flight, range(10, 20)))
+    info, units = flight.info(), units_of(flight, 20)[10:]
     last_shown, go_on = threading.Event(), threading.Event()
     users: list[SessionBacklog] = []
 
@@ -61,14 +71,11 @@ def test_work_that_was_never_begun_lets_its_recording_go():
 class SlowFile(SinkWriter[Event]):
     """Writes when the disk is ``ready``; ``breaks`` makes the next write fail."""
 
-    path = None
-
     def __init__(self) -> None:
         self.ready, self.writing, self.breaks = threading.Event(), threading.Event(), threading.Event()
         self.written: list[Event] = []
 
     def log(self, item: Event) -> None:
-        """Write when there is a disk."""
         self.writing.set()
         self.ready.wait(timeout=60)
         if self.breaks.is_set():
@@ -76,16 +83,14 @@ class SlowFile(SinkWriter[Event]):
             raise OSError(28, "No space left on device")
         self.written.append(item)
 
-    def skipped(self, count: int) -> None:
-        """Nothing is said of it."""
-
-    def close(self, hurry: threading.Event | None = None) -> None:
-        """It has no end."""
-
     @property
     def frames(self) -> list[int]:
         """Of the video that is written."""
         return [one.frame_index for one in self.written if isinstance(one, VideoSample)]
+
+
+def sink_of(open_sink: Callable[[], SinkWriter[Any]]) -> QueuedSink[Any]:
+    return QueuedSink("recording", open_sink, failures=Failures(time.time_ns))
 
 
 class Outage:
@@ -94,35 +99,23 @@ class Outage:
     def __init__(self) -> None:
         self.flight = Flight(30, keyframes=(0,))
         self.file = SlowFile()
-        self.sink: QueuedSink[Event] = QueuedSink(
-            "recording", lambda: self.file, failures=Failures(time.time_ns)
-        )
+        self.sink = sink_of(lambda: self.file)
         assert self.sink.is_open(within_s=20)
         self.backlog = SessionBacklog(
-            self.flight.info(),
-            log=self.sink.log,
-            perception=None,
-            read=self._read,
-            outputs=[self.sink],
+            self.flight.info(), log=self.sink.log, perception=None, read=self._read, outputs=[self.sink]
         )
-        self.units = [
-            BacklogUnit(frame_index=i, capture_ns=u.capture_ns, data=u.data, keyframe=u.keyframe)
-            for i, u in enumerate(self.flight.units)
-        ]
         self.said: list[bool | None] = []
         self._to = lambda: nullcontext(self.backlog if self.backlog.able() else None)
 
     def video(self) -> Job:
-        """The edge sends its video, perhaps again."""
         worker = patient_worker(lambda *_: None, lambda *_: None, lambda _stills: None)
         worker.close()
-        return show_video(self.units, self._to, worker=worker, done=self.said.append)
+        return show_video(units_of(self.flight, 30), self._to, worker=worker, done=self.said.append)
 
     def still(self) -> Job:
-        """The edge sends a still, perhaps again."""
         item = self.flight.still(3, 7)
-        header = RoiHeader.parse(item.attachment, item.payload)
-        return read_still(ReceivedStill(header, item.payload), self._to, done=self.said.append)
+        still = ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
+        return read_still(still, self._to, done=self.said.append)
 
     def hold(self) -> None:
         """The disk stops in the middle of an event."""
@@ -130,21 +123,13 @@ class Outage:
         assert self.file.writing.wait(timeout=60)
 
     def fill(self, count: int) -> None:
-        """So many live events come while the disk stands still."""
         for number in range(count):
             self.sink.log(Notice(number, number, "info", "live"))
 
     def _read(self, still: ReceivedStill) -> None:
-        header = still.header
-        self.sink.log(
-            refinement(
-                frame_index=header.frame_index,
-                capture_ns=header.capture_ns,
-                still_sequence=header.sequence,
-                still=still.data,
-                stored=True,
-            )
-        )
+        of = still.header
+        at = {"frame_index": of.frame_index, "capture_ns": of.capture_ns, "still_sequence": of.sequence}
+        self.sink.log(refinement(**at, still=still.data, stored=True))
 
 
 def finish(job: Job) -> None:
@@ -230,3 +215,65 @@ def test_a_stretch_that_broke_off_comes_again_although_there_is_room_a_moment_la
     eventually(lambda: outage.said == [None, True], what="the rest is written")
     assert outage.file.frames == list(range(30))
     outage.sink.close()
+
+
+def test_a_ground_that_runs_for_months_takes_former_sessions_every_day(tmp_path):
+    """After the thirty-second flight with an outage all that drones have stored would be refused for ever."""
+    now_s, made = 0.0, []
+
+    def open_one(info) -> BacklogRecording:
+        made.append(sink_of(lambda: LineFile(tmp_path / f"{info.session_id}.csv", ("a",))))
+        return BacklogRecording(info, sink=made[-1], perception=StoredPerception(info))
+
+    recordings = BacklogRecordings(open_one, most_files=2, open_s=20.0, clock=lambda: now_s)
+    first, second, third = (replace(Flight(1).info(), session_id=number) for number in (1, 2, 3))
+    with recordings.using(first) as backlog, recordings.using(second) as other:
+        assert None not in (backlog, other)
+    assert not recordings.takes(3), "whoever invents sessions does not fill the disk"
+    with recordings.using(third) as backlog:
+        assert backlog is None
+    now_s = 86_400.0
+    assert recordings.takes(3)
+    with recordings.using(third) as backlog:
+        assert backlog is not None
+    recordings.close()
+    for one in made:
+        one.join(time.monotonic() + 60)
+
+
+def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
+    """The live picture would stand still until the disk has made a file for what was stored long ago."""
+    info = Flight(1).info()
+    pipe = tmp_path / "recording"
+    os.mkfifo(pipe)  # opening it waits for a reader
+    opened = threading.Event()
+    sinks: list[QueuedSink] = []
+
+    def open_one(info) -> BacklogRecording:
+        sinks.append(sink_of(lambda: LineFile(pipe, ("a",))))
+        opened.set()
+        return BacklogRecording(info, sink=sinks[-1], perception=StoredPerception(info))
+
+    recordings = BacklogRecordings(open_one, open_s=60.0)
+    acquired: list[SessionBacklog | None] = []
+
+    def acquire() -> None:
+        with recordings.using(info) as backlog:
+            acquired.append(backlog)
+
+    worker = threading.Thread(target=acquire)
+    worker.start()
+    assert opened.wait(timeout=60)
+    assert recordings.takes(info.session_id), "what the receiving thread asks of each chunk"
+    with recordings.using(info) as other:
+        assert other is None, "nobody else waits for it: it is to come again"
+    assert recordings.open_sessions == [info.session_id]
+    assert not acquired, "it is still being opened"
+    with pipe.open():
+        worker.join(timeout=60)
+        (backlog,) = acquired
+        assert backlog is not None
+        with recordings.using(info) as other:
+            assert other is backlog
+        recordings.close()
+        eventually(lambda: sinks[0].ended, what="its thread ends")
