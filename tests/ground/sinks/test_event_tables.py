@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,13 +49,11 @@ def test_a_still_is_written_as_it_arrived_with_the_place_it_shows(tmp_path):
 
 def test_a_folder_that_is_gone_is_said(tmp_path):
     """The ground would end in a traceback, or write nowhere."""
-    folder = tmp_path / "stills"
-    folder.mkdir()
-    sink = StillFiles(folder / "uav.csv")
-    folder.rename(tmp_path / "elsewhere")
-    with pytest.raises(UserError, match="000004"):
+    (tmp_path / "stills").mkdir()
+    sink = StillFiles(tmp_path / "stills" / "uav.csv")
+    (tmp_path / "stills").rename(tmp_path / "elsewhere")
+    with closing(sink), pytest.raises(UserError, match="000004"):
         sink.log(STILL)
-    sink.close()
 
 
 def test_a_disk_without_room_leaves_no_half_of_a_picture(tmp_path, monkeypatch):
@@ -67,9 +66,8 @@ def test_a_disk_without_room_leaves_no_half_of_a_picture(tmp_path, monkeypatch):
 
     sink = StillFiles(tmp_path / "uav.csv")
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(UserError, match="000004"):
+    with closing(sink), pytest.raises(UserError, match="000004"):
         sink.log(STILL)
-    sink.close()
     assert [one.name for one in tmp_path.iterdir()] == ["uav.csv"]
 
 
@@ -94,18 +92,11 @@ def test_each_line_says_who_knows_of_the_track(tmp_path, origins, expected):
     table.close()
     every = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
     assert {row["capture_utc"] for row in every} == {"2023-11-14T22:13:20.123Z"}
-    assert [(row["frame_index"], row["late"]) for row in every] == [
-        ("4", "0"),
-        ("4", "0"),
-        ("2", "1"),
-        ("2", "1"),
-    ]
+    assert [(row["frame_index"], row["late"]) for row in every] == [("4", "0")] * 2 + [("2", "1")] * 2
     rows = every[:2]
     assert [row["origin"] for row in rows] == list(expected)
-    assert [(row["frame_index"], row["id"], row["class"], row["refined"]) for row in rows] == [
-        ("4", "3", "car", "0"),
-        ("4", "9", "bus", "1"),
-    ]
+    seen = [[row[name] for name in ("id", "class", "refined")] for row in rows]
+    assert seen == [["3", "car", "0"], ["9", "bus", "1"]]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ import os
 import signal
 import time
 import weakref
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -21,7 +23,33 @@ from hvt_ground.sinks.rerun.live_view import LiveView, listening
 from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
 from programs.processes import eventually, free_ports
-from programs.rrd import Recording, settings
+from programs.rrd import Recording, recorded, settings
+
+
+@pytest.fixture
+def pipe(tmp_path) -> Path:
+    """A file of a slow disk: opening it waits for a reader, writing for room."""
+    path = tmp_path / "table.csv"
+    os.mkfifo(path)
+    return path
+
+
+@pytest.fixture
+def failures() -> Failures:
+    return Failures(time.time_ns)
+
+
+@pytest.fixture
+def viewer() -> Iterator[tuple[LiveView, Callable[[], None]]]:
+    """One that shows, and how to kill it."""
+    port, web_port = free_ports(2)
+    with LiveView("serve", port=port, web_port=web_port) as view:
+
+        def kill() -> None:
+            os.kill(view.pid, signal.SIGKILL)
+            eventually(lambda: not listening(port), what="the viewer is dead")
+
+        yield view, kill
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +59,8 @@ def samples() -> list[VideoSample]:
     return [VideoSample(i, START_NS + i * STEP_NS, *unit) for i, unit in enumerate(units)]
 
 
-def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):
+def test_a_disk_that_does_not_answer_holds_nobody_up(pipe, failures, caplog):
     """The picture would stand still until a slow card has written, or the memory fill with what it is to write."""
-    pipe = tmp_path / "table.csv"
-    os.mkfifo(pipe)  # opening it waits for a reader, writing for room
-    failures = Failures(time.time_ns)
     sink = QueuedSink("tracks table", lambda: LineFile(pipe, ("a",)), failures=failures)
     for _ in range(10_000):  # one that waited would wait for ever
         sink.log("x" * 100 + "\n")
@@ -50,12 +75,9 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):
     assert failures.parts == (), "slow is not broken"
 
 
-def test_a_disk_that_hangs_is_said_until_it_answers(tmp_path, monkeypatch):
+def test_a_disk_that_hangs_is_said_until_it_answers(pipe, failures, monkeypatch):
     """A recording's disk hung for a minute: the queue filled, and status, page and report called all well."""
     monkeypatch.setattr(failures_module, "SILENT_NS", 0)
-    pipe = tmp_path / "table.csv"
-    os.mkfifo(pipe)
-    failures = Failures(time.time_ns)
     sink = QueuedSink("tracks table", lambda: LineFile(pipe, ("a",)), failures=failures)
     eventually(lambda: [one.part for one in failures.now] == ["tracks table"], what="it is said")
     with pipe.open() as reader:
@@ -65,13 +87,12 @@ def test_a_disk_that_hangs_is_said_until_it_answers(tmp_path, monkeypatch):
     assert not failures.now
 
 
-def test_one_that_has_ended_does_not_fail_any_more():
+def test_one_that_has_ended_does_not_fail_any_more(failures):
     """The status line would tell of a recording for ever whose session is over; the summary does."""
 
     def refused() -> SinkWriter[str]:
         raise UserError("no room")
 
-    failures = Failures(time.time_ns)
     sink = QueuedSink("recording of uav-1", refused, failures=failures)
     eventually(lambda: failures.now, what="it has failed")
     sink.close()
@@ -85,14 +106,14 @@ def test_one_that_has_ended_does_not_fail_any_more():
     )
 
 
-def test_one_that_waits_for_a_keyframe_has_it_asked_for_once():
+def test_one_that_waits_for_a_keyframe_has_it_asked_for_once(failures):
     """An edge that makes none by itself would never show it a picture."""
 
     class Waiting(SinkWriter[str]):
         def log(self, item: str) -> None:
             self.awaits_keyframe = item == "waits"
 
-    sink = QueuedSink("page", Waiting, failures=Failures(time.time_ns))
+    sink = QueuedSink("page", Waiting, failures=failures)
     for item, asks in (("shown", False), ("waits", True), ("shown", False)):
         sink.log(item)
         eventually(lambda: sink.idle, what="it is taken")
@@ -100,11 +121,8 @@ def test_one_that_waits_for_a_keyframe_has_it_asked_for_once():
     sink.close()
 
 
-def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path, caplog):
+def test_one_that_never_answers_does_not_keep_the_ground_from_ending(pipe, failures, caplog):
     """Ctrl-C would be answered with kill -9."""
-    pipe = tmp_path / "table.csv"
-    os.mkfifo(pipe)
-    failures = Failures(time.time_ns)
     outputs = Outputs(failures)
     sink = outputs.open("tracks table", lambda: LineFile(pipe, ("a",)))
     outputs.close(within_s=0.1)
@@ -129,7 +147,7 @@ def test_a_sink_that_has_ended_keeps_nothing_of_what_made_it(tmp_path):
     assert maker() is None
 
 
-def test_what_sends_to_others_is_made_again_after_the_longest_pause(caplog):
+def test_what_sends_to_others_is_made_again_after_the_longest_pause(failures, caplog):
     """A server that cuts each connection at once would see everything go stale between two tries."""
     tries: list[float] = []
 
@@ -137,18 +155,15 @@ def test_what_sends_to_others_is_made_again_after_the_longest_pause(caplog):
         tries.append(time.monotonic())
         raise OSError("it has closed the connection")
 
-    failures = Failures(time.time_ns)
     sink: QueuedSink[str] = Outputs(failures).open("CoT", cut, longest_pause_s=0.01)
     eventually(lambda: len(tries) > 4, what="it is tried again")
     assert sink.join(time.monotonic() + 60)
     assert sum("tried again" in one.message for one in caplog.records) == 1
 
 
-def test_in_lockstep_a_full_queue_is_waited_for(tmp_path):
+def test_in_lockstep_a_full_queue_is_waited_for(pipe, failures):
     """Two runs of one input would leave two different tables, by the speed of the disk."""
-    pipe = tmp_path / "table.csv"
-    os.mkfifo(pipe)
-    sink = QueuedSink("table", lambda: LineFile(pipe, ("a",)), failures=Failures(time.time_ns), wait_s=30.0)
+    sink = QueuedSink("table", lambda: LineFile(pipe, ("a",)), failures=failures, wait_s=30.0)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     read = b""
     for number in range(6000):
@@ -185,54 +200,50 @@ def test_video_goes_on_at_a_keyframe_after_a_gap(samples, tmp_path):
     assert (13, "WARN", "3 events are missing here: writing was too slow") in recording.events()
 
 
-def test_a_viewer_that_is_killed_is_told_of_and_started_again(samples, tmp_path, caplog):
+def test_a_viewer_that_is_killed_is_told_of_and_started_again(samples, viewer, failures, tmp_path, caplog):
     """Closing the window must not cost the flight, and a web viewer that has crashed come back for the next look."""
-    port, web_port = free_ports(2)
-    failures = Failures(time.time_ns)
-    outputs = Outputs(failures)
-    with LiveView("serve", port=port, web_port=web_port) as view:
+    outputs, (view, kill) = Outputs(failures), viewer
 
-        def shown() -> Recorder:
-            view.start_again()
-            return Recorder(settings(None, live_url=view.url))
+    def shown() -> Recorder:
+        view.start_again()
+        return Recorder(settings(None, live_url=view.url))
 
-        recording = outputs.open("recording", lambda: Recorder(settings(tmp_path / "a.rrd")))
-        live = outputs.open("live view", shown)
-        feed(samples[:20], recording, live)
-        eventually(lambda: live.is_open() and live.idle, what="it is shown")
-        os.kill(view.pid, signal.SIGKILL)
-        eventually(lambda: not listening(port), what="the viewer is dead")
-        eventually(lambda: _told(failures, live), what="that is noticed")
-        (failed,) = failures.parts
-        assert (failed.part, failed.reason) == ("live view", f"the viewer at {view.url} is gone")
-        feed(samples[20:], recording, live)
-        eventually(live.is_open, what="it is started again")
-        assert live.take_resumed(), "which asks for a keyframe"
-        assert listening(port)
-        assert failures.parts[0].working
-        outputs.close(within_s=60)
+    def told() -> bool:
+        live.log(Notice(0, START_NS, "info", "still there?"))
+        time.sleep(0.05)
+        return bool(failures.parts)
+
+    recording = outputs.open("recording", lambda: Recorder(settings(tmp_path / "a.rrd")))
+    live = outputs.open("live view", shown)
+    feed(samples[:20], recording, live)
+    eventually(lambda: live.is_open() and live.idle, what="it is shown")
+    kill()
+    eventually(told, what="that is noticed")
+    (failed,) = failures.parts
+    assert (failed.part, failed.reason) == ("live view", f"the viewer at {view.url} is gone")
+    feed(samples[20:], recording, live)
+    eventually(live.is_open, what="it is started again")
+    assert live.take_resumed(), "which asks for a keyframe"
+    assert failures.parts[0].working
+    outputs.close(within_s=60)
     assert live.missing > 0
     assert recording.missing == 0
     assert len(Recording(tmp_path / "a.rrd").video()) == len(samples)
     assert [one.split(":")[0] for one in caplog.messages] == ["live view", "live view"], "once each way"
 
 
-def test_a_recording_does_not_mind_that_a_viewer_is_gone(samples, tmp_path):
+def test_a_recording_does_not_mind_that_a_viewer_is_gone(samples, viewer, tmp_path):
     """The SDK tells whoever ends a recording that another one's viewer is gone: that recording broke off."""
-    port, web_port = free_ports(2)
-    with LiveView("serve", port=port, web_port=web_port) as view:
-        live = Recorder(settings(None, live_url=view.url))
-        live.log(samples[0])
-        os.kill(view.pid, signal.SIGKILL)
-        eventually(lambda: not listening(port), what="the viewer is dead")
-        for number in range(30):  # while the SDK finds out that nobody takes what it sends
-            with suppress(UserError):
-                live.log(samples[number + 1])
-            with Recorder(settings(tmp_path / f"{number}.rrd")) as recorder:
-                recorder.log(samples[0])
-            assert len(Recording(tmp_path / f"{number}.rrd").video()) == 1
+    view, kill = viewer
+    live = Recorder(settings(None, live_url=view.url))
+    live.log(samples[0])
+    kill()
+    for number in range(30):  # while the SDK finds out that nobody takes what it sends
         with suppress(UserError):
-            live.close(None)
+            live.log(samples[number + 1])
+        assert len(Recording(recorded(tmp_path / f"{number}.rrd", samples[:1])).video()) == 1
+    with suppress(UserError):
+        live.close(None)
 
 
 def feed(events: list[Event], *sinks: QueuedSink[Event]) -> None:
@@ -240,9 +251,3 @@ def feed(events: list[Event], *sinks: QueuedSink[Event]) -> None:
     for event in events:
         for sink in sinks:
             sink.log(event)
-
-
-def _told(failures: Failures, live: QueuedSink[Event]) -> bool:
-    live.log(Notice(0, START_NS, "info", "still there?"))
-    time.sleep(0.05)
-    return bool(failures.parts)

@@ -75,7 +75,6 @@ def test_the_legend_is_below_the_picture_and_does_not_collide():
 
 
 def recorded(path: Path, *events) -> Recording:
-    """A recording of these."""
     return Recording(rrd.recorded(path, events, base_size=SIZE))
 
 
@@ -104,9 +103,8 @@ def test_words_stand_where_a_still_renamed_or_doubts(tmp_path):
     boxes = read.boxes(0)
     assert {track: box.doubted for track, box in boxes.items()} == {1: False, 2: False, 3: True, 4: False}
     assert (boxes[3].class_before, boxes[3].class_after) == ("car", "other")
-    gone = recorded(
-        tmp_path / "b.rrd", overlay(), overlay(1, classes=("car",) * 4, doubted=np.zeros(4, np.bool_))
-    )
+    plain = overlay(1, classes=("car",) * 4, doubted=np.zeros(4, np.bool_))
+    gone = recorded(tmp_path / "b.rrd", overlay(), plain)
     assert gone.words(1) == {}, "a word whose reason is gone is gone"
 
 
@@ -118,11 +116,8 @@ def test_what_is_not_sure_has_no_check_mark(tmp_path):
 
 def test_brightness_follows_the_probability(tmp_path):
     """A guess and a certainty would look alike."""
-    read = recorded(
-        tmp_path / "a.rrd",
-        overlay(),
-        overlay(1, confidences=np.full(4, 0.7, np.float32), sure=np.zeros(4, np.bool_)),
-    )
+    guessed = overlay(1, confidences=np.full(4, 0.7, np.float32), sure=np.zeros(4, np.bool_))
+    read = recorded(tmp_path / "a.rrd", overlay(), guessed)
     unsure, sure = (ink(read, "/base/tracks", 0)[0], ink(read, "/base/refined", 0))
     assert unsure < ink(read, "/base/tracks", 1)[0] < sure[1]
     assert sure[1] > ink(read, "/base/refined", 1)[1]
@@ -181,16 +176,8 @@ def test_the_log_says_what_a_still_did(tmp_path, changes, text):
 def test_the_colours_that_are_shown_stand_in_the_legend(tmp_path):
     """A stranger would not know that blue is a car."""
     read = recorded(tmp_path / "a.rrd", overlay(), overlay(1, base_classes=("bus", "car", "car", "car")))
-    assert set(read.rows("/base/legend", "Points2D:labels")[-1][2]) == {
-        "car",
-        "van",
-        "other",
-        "something",
-        "bus",
-    }
-
-
-# Where stills lie in the gallery, those of now and those of an outage that come late.
+    legend = set(read.rows("/base/legend", "Points2D:labels")[-1][2])
+    assert legend == {"car", "van", "other", "something", "bus"}
 
 
 @given(events=st.lists(st.tuples(st.booleans(), st.integers(0, 60)), max_size=60))
@@ -213,13 +200,9 @@ def test_each_pair_is_held_for_a_while_whatever_comes_when(events):
 def test_an_old_still_holds_its_slot_for_a_while_only_where_one_is_free():
     """Pairs would flicker by, or an old one would push out what is shown now."""
     gallery = Gallery(2, hold_ns=10)
-    assert gallery.put(0, 0, changed=False) == 0
-    assert gallery.put(1, 0, changed=False) == 1
-    assert gallery.put(100, 100, changed=False) == 0
-    assert gallery.put_stored(50, 50) == 0
-    assert gallery.put_stored(55, 55) == 1
-    assert gallery.put_stored(57, 57) is None
-    assert gallery.put_stored(95, 95) == 1
+    live = [(0, 0), (1, 0), (100, 100)]
+    assert [gallery.put(frame, at_ns, changed=False) for frame, at_ns in live] == [0, 1, 0]
+    assert [gallery.put_stored(frame, frame) for frame in (50, 55, 57, 95)] == [0, 1, None, 1]
 
 
 def test_what_is_too_long_ago_to_tell_finds_no_slot():

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import os
+import socket
 import subprocess
 import threading
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -45,7 +47,6 @@ def events(units: list[tuple[bytes, bool]]) -> list[Event]:
 
 
 def of(kind: type, events: list[Event]) -> list:
-    """The events of one kind."""
     return [event for event in events if isinstance(event, kind)]
 
 
@@ -55,34 +56,26 @@ def recording(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> 
     return Recording(recorded(tmp_path_factory.mktemp("rrd") / "flight.rrd", events))
 
 
+def read_back(path: Path, events: Iterable[Event], **changes: Any) -> Recording:
+    return Recording(recorded(path / "a.rrd", events, **changes))
+
+
 def test_the_video_is_the_stream_as_received(recording: Recording, events: list[Event]) -> None:
-    """Otherwise the recording would not show what the link carried, or not at its time."""
+    """A recording would not show what the link carried, or not at its time, or no player could decode it."""
     logged = [(s.frame_index, s.capture_ns, s.data) for s in of(VideoSample, events)]
     assert recording.video() == logged
     assert recording.rows("/base/video", "VideoStream:codec")[0][2] == [int.from_bytes(b"hev1")]
-
-
-def test_the_video_decodes_in_order_from_the_file(recording: Recording) -> None:
-    """A recording whose video no decoder can play is worth nothing."""
     decoder = av.CodecContext.create("hevc", "r")
     decoder.thread_type = "SLICE"
     pictures = [p for _, _, data in recording.video() for p in decoder.decode(av.Packet(data))]
-    assert len(pictures) == FRAMES
-    assert (pictures[0].width, pictures[0].height) == SIZE
-
-
-def test_only_the_two_timelines_are_there(recording: Recording) -> None:
-    """A third timeline would cost bytes in every row and offer the viewer's user a time that means nothing."""
-    assert recording.timelines == {"frame", "capture_time"}
+    assert [(one.width, one.height) for one in pictures] == [SIZE] * FRAMES
 
 
 def test_it_opens_as_a_screen(recording: Recording) -> None:
-    """Without its blueprint the file opens as a heap of entities."""
-    assert recording.blueprints == 1
+    """It would open as a heap of entities; a third timeline offer a time that means nothing, in every row."""
+    assert (recording.blueprints, recording.timelines) == (1, {"frame", "capture_time"})
     text = recording.rows("/session", "TextDocument:text")[0][2][0]
-    assert "uav-1" in text
-    assert "method **M5**" in text
-    assert "400" in text
+    assert all(one in text for one in ("uav-1", "method **M5**", "400"))
 
 
 def test_every_frame_shows_the_boxes_that_were_logged(recording: Recording, events: list[Event]) -> None:
@@ -103,9 +96,7 @@ def test_a_refined_track_says_so(recording: Recording, events: list[Event]) -> N
     """The user must see in the picture which classes rest on a still, and what they were before."""
     last = of(Overlay, events)[-1]
     boxes = recording.boxes(last.frame_index)
-    labels = {
-        t: boxes[t].label for t, refined in zip(last.track_ids.tolist(), last.refined, strict=True) if refined
-    }
+    labels = {track: boxes[track].label for track in last.track_ids[last.refined].tolist()}
     assert len(labels) >= 3
     changed = {track for track in labels if boxes[track].class_before != boxes[track].class_after}
     assert changed
@@ -136,15 +127,8 @@ def test_a_finer_still_is_shown_beside_an_enlarged_crop(events: list[Event], tmp
     refinement = of(Refinement, events)[0]
     large = cv2.resize(refinement.base_crop_bgr, None, fx=3, fy=3)
     still = cv2.imencode(".png", large)[1].tobytes()
-    path = tmp_path / "a.rrd"
-    with Recorder(settings(path)) as recorder:
-        recorder.log(dataclasses.replace(refinement, still=still, media_type="image/png"))
-        recorder.log(
-            dataclasses.replace(
-                refinement, still_sequence=1, still=still, media_type="image/png", base_crop_bgr=None
-            )
-        )
-    read = Recording(path)
+    first = replace(refinement, still=still, media_type="image/png")
+    read = read_back(tmp_path, [first, replace(first, still_sequence=1, base_crop_bgr=None)])
     shapes = [cv2.imdecode(np.frombuffer(data, np.uint8), 1).shape for _, data in read.base_crops()]
     assert large.shape in shapes
     assert (3, 4, 3) in shapes  # a frame that was gone is a blank, not the crop of the still before
@@ -154,10 +138,9 @@ def test_a_finer_still_is_shown_beside_an_enlarged_crop(events: list[Event], tmp
 def test_traffic_and_tracks_are_plotted(recording: Recording, events: list[Event]) -> None:
     """The user checks the budget on this plot."""
     traffic = of(Traffic, events)
-    rates = recording.lines("/link/bitrate")
-    assert rates == [
-        (t.frame_index, [t.total_bps / 1e3, t.base_bps / 1e3, t.roi_bps / 1e3, t.budget_bps / 1e3])
-        for t in traffic
+    rates = [[one / 1e3 for one in (t.total_bps, t.base_bps, t.roi_bps, t.budget_bps)] for t in traffic]
+    assert recording.lines("/link/bitrate") == [
+        (t.frame_index, rate) for t, rate in zip(traffic, rates, strict=True)
     ]
     latencies = recording.lines("/link/latency")
     assert [values[0] for _, values in latencies] == [40.0] * len(traffic)
@@ -178,13 +161,12 @@ def test_events_name_the_still_that_caused_a_refinement(recording: Recording, ev
 
 def test_nothing_undecodable_is_logged(units: list[tuple[bytes, bool]], tmp_path: Path) -> None:
     """Rerun shows garbage for what no decoder can start with, and restarts when time runs backwards."""
-    path = tmp_path / "late.rrd"
-    with Recorder(settings(path)) as recorder:
-        recorder.log(VideoSample(1, START_NS, units[1][0], keyframe=True))  # without parameter sets
-        for index in [3, 4, 20, 21, 21, 20, 22]:
-            recorder.log(VideoSample(index, START_NS + index * STEP_NS, *units[index]))
-        recorder.log(VideoSample(23, START_NS + 23 * STEP_NS, b"", keyframe=False))
-    assert [frame for frame, _, _ in Recording(path).video()] == [20, 21, 22]
+    without_parameters = VideoSample(1, START_NS, units[1][0], keyframe=True)
+    order = (3, 4, 20, 21, 21, 20, 22)
+    samples = [VideoSample(index, START_NS + index * STEP_NS, *units[index]) for index in order]
+    empty = VideoSample(23, START_NS + 23 * STEP_NS, b"", keyframe=False)
+    read = read_back(tmp_path, [without_parameters, *samples, empty])
+    assert [frame for frame, _, _ in read.video()] == [20, 21, 22]
 
 
 def test_folding_changes_nothing_but_the_size(events: list[Event], tmp_path: Path) -> None:
@@ -198,10 +180,8 @@ def test_folding_changes_nothing_but_the_size(events: list[Event], tmp_path: Pat
             assert recorder.size_bytes == path.stat().st_size
             sizes.append(recorder.size_bytes)
     one, other = Recording(plain), Recording(compacted)
-    assert one.video() == other.video()
-    assert one.events() == other.events()
-    assert one.stills() == other.stills()
-    assert one.boxes(FRAMES - 1) == other.boxes(FRAMES - 1)
+    for read in (Recording.video, Recording.events, Recording.stills, lambda one: one.boxes(FRAMES - 1)):
+        assert read(one) == read(other)
     assert sizes[1] < 0.8 * sizes[0]
 
 
@@ -233,19 +213,14 @@ def test_closing_twice_is_fine_and_nothing_is_written_after(events: list[Event],
     assert path.stat().st_size == size
 
 
-@pytest.mark.parametrize(("name", "said"), [("no/such/f.rrd", "does not exist"), ("", "is a folder")])
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("no/such/f.rrd", "does not exist"), ("", "is a folder"), ("/dev/full", "No space left")],
+)
 def test_a_path_that_cannot_be_written_is_one_sentence(tmp_path: Path, name: str, said: str) -> None:
-    """The user mistyped --record and should read what to mend."""
+    """The user mistyped --record and should read what to mend; or it silently stops, found out when it is needed."""
     with pytest.raises(UserError, match=said):
         Recorder(settings(tmp_path / name))
-
-
-def test_a_full_disk_is_one_sentence(events: list[Event]) -> None:
-    """A recording that silently stops is found out when it is needed."""
-    if not Path("/dev/full").exists():
-        pytest.skip("no /dev/full on this system")
-    with pytest.raises(UserError, match="No space left"):
-        Recorder(settings(Path("/dev/full")))
     assert Path("/dev/full").is_char_device(), "what was there before is not removed"
 
 
@@ -304,10 +279,10 @@ def test_a_recording_that_ended_verifies(events: list[Event], tmp_path: Path, fr
 def test_in_a_hurry_the_footer_is_left_out(events: list[Event], tmp_path: Path) -> None:
     """Ctrl-C would wait for an hour's recording to be written once more."""
     path, hurry = tmp_path / "a.rrd", threading.Event()
+    hurry.set()
     recorder = Recorder(settings(path))
     for event in events:
         recorder.log(event)
-    hurry.set()
     recorder.close(hurry)
     assert len(Recording(path).video()) == FRAMES
     assert list(tmp_path.iterdir()) == [path]
@@ -319,36 +294,28 @@ def test_a_recording_that_was_removed_is_noticed(events: list[Event], tmp_path: 
     recorder = Recorder(settings(path))
     recorder.log(events[0])
     path.unlink()
-    with pytest.raises(UserError, match="it was removed"):
-        recorder.log(events[1])
-    with pytest.raises(UserError, match="it was removed"):
-        recorder.close()
+    for writes in (lambda: recorder.log(events[1]), recorder.close):
+        with pytest.raises(UserError, match="it was removed"):
+            writes()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_each_edge_has_a_screen_of_its_own(tmp_path: Path) -> None:
     """A viewer that shows two edges would show both with the size, budget and plots of the one that came last."""
-    stores = []
+    stores = set()
     for edge in ("uav-1", "uav-2"):
-        path = tmp_path / f"{edge}.rrd"
-        with Recorder(settings(path, edge_id=edge)):
-            pass
-        reader = Recording(path).reader
+        reader = Recording(recorded(tmp_path / f"{edge}.rrd", (), edge_id=edge)).reader
         (recording,), (blueprint,) = reader.recordings(), reader.blueprints()
         assert recording.application_id == blueprint.application_id
         assert recording.recording_id == f"{edge}-00ff", "a backlog of the session is shown with it"
-        stores.append(recording.application_id)
-    assert len(set(stores)) == 2
+        stores.add(recording.application_id)
+    assert len(stores) == 2
 
 
 def test_plots_have_a_hole_where_nothing_came(tmp_path: Path) -> None:
     """A line through an outage says that the link carried something."""
-    path = tmp_path / "a.rrd"
-    with Recorder(settings(path)) as recorder:
-        for second in (0, 1, 2, 9, 10):
-            at = START_NS + second * 1_000_000_000
-            recorder.log(Traffic(15 * second, at, 3e5, 1e5, 4e5, 4e5, 20.0, 40.0, 7, 2))
-    recording = Recording(path)
+    times = [(15 * second, START_NS + second * 1_000_000_000) for second in (0, 1, 2, 9, 10)]
+    recording = read_back(tmp_path, [Traffic(*at, 3e5, 1e5, 4e5, 4e5, 20.0, 40.0, 7, 2) for at in times])
     for entity in ("/link/bitrate", "/link/latency", "/link/tracks"):
         rows = recording.lines(entity)
         assert [frame for frame, _ in rows] == [0, 15, 30, 31, 135, 150]
@@ -377,14 +344,11 @@ def test_a_recording_is_at_most_half_as_large_again_as_what_was_received(
     frames = _carpark(data, 75)
     units = coded(frames, kbps=base_kbps)
     frames, units = frames * 4, units * 4  # 20 s; each quarter begins at a keyframe as the first
+    timed = list(session(frames, units, tracks=58, total_kbps=total_kbps))
     path = tmp_path / "a.rrd"
-    received = 0
-    with Recorder(settings(path, base_size=(1280, 720), budget_bps=total_kbps * 1000)) as recorder:
-        for event, size_bytes in session(frames, units, tracks=58, total_kbps=total_kbps):
-            recorder.log(event)
-            received += size_bytes
-    assert len(Recording(path).video()) == 300
-    assert path.stat().st_size <= 1.5 * received
+    sent = [event for event, _ in timed]
+    assert len(read_back(tmp_path, sent, base_size=(1280, 720), budget_bps=total_kbps * 1000).video()) == 300
+    assert path.stat().st_size <= 1.5 * sum(size_bytes for _, size_bytes in timed)
 
 
 def _carpark(data: Path, count: int) -> list[np.ndarray]:
@@ -399,30 +363,19 @@ def _carpark(data: Path, count: int) -> list[np.ndarray]:
     return frames
 
 
-def test_a_taken_port_is_one_sentence(free_port: int) -> None:
+def test_a_taken_port_is_one_sentence() -> None:
     """Two grounds on one machine: the second must say why it cannot show."""
-    import socket
-
     with socket.socket() as taken:
-        taken.bind(("127.0.0.1", free_port))
+        taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(UserError, match=f"port {free_port}"):
-            LiveView("serve", port=free_port, web_port=_another(free_port))
-
-
-def _another(port: int) -> int:
-    other = free_port()
-    return other if other != port else free_port()
-
-
-# -- the pure parts -------------------------------------------------------------------------------------------------
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match=f"port {port}"):
+            LiveView("serve", port=port, web_port=free_port())
 
 
 def overlay(frame: int, boxes: np.ndarray, *, refined: bool = False, confidence: float = 0.8) -> Overlay:
-    """Cars 1, 2, 3 … at the boxes."""
-    count, capture_ns = len(boxes), START_NS + frame * STEP_NS
-    values = {"refined": np.full(count, refined), "confidences": np.full(count, confidence, np.float32)}
-    return examples.overlay(frame, boxes, capture_ns=capture_ns, **values)
+    values = {"refined": np.full(len(boxes), refined), "confidences": np.float32([confidence] * len(boxes))}
+    return examples.overlay(frame, boxes, capture_ns=START_NS + frame * STEP_NS, **values)
 
 
 def test_an_overlay_that_shows_the_same_writes_nothing() -> None:
@@ -506,10 +459,8 @@ def test_colours_tell_kinds_apart() -> None:
     """A van of the detector and a minivan of the classifier are the same kind; a car and a truck are not."""
     assert class_colour("van") == class_colour("minivan")
     assert class_colour("sports car, sport car") == class_colour("car")
-    kinds = {
-        class_colour(n) for n in ("car", "van", "truck", "bus", "pedestrian", "bicycle", "motor", "tricycle")
-    }
-    assert len(kinds) == 8
+    kinds = ("car", "van", "truck", "bus", "pedestrian", "bicycle", "motor", "tricycle")
+    assert len(set(map(class_colour, kinds))) == 8
     assert class_colour("dragonfly") == class_colour("dragonfly")
 
 
@@ -521,9 +472,8 @@ def test_a_new_class_a_frame_fills_no_disk(tmp_path: Path, monkeypatch: pytest.M
         box = moving_boxes(0, 1, SIZE)
         for number in range(120):
             name = (f"class {number} of a hostile edge",)
-            written.log(
-                replace(overlay(number, box), track_ids=np.array([number]), classes=name, base_classes=name)
-            )
+            shown = replace(overlay(number, box), track_ids=np.array([number]))
+            written.log(replace(shown, classes=name, base_classes=name))
             largest = max(largest, path.stat().st_size)
     legend = Recording(path).rows("/base/legend", "Points2D:labels")[-1][2]
     assert (len(legend), "other" in legend) == (60, True)

@@ -10,15 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.rrd_file import open_rrd
 from programs import rrd
 from programs.processes import eventually
 
 
-def settings_of(folder: Path, number: int = 0) -> RecorderSettings:
-    """A small recording."""
-    return rrd.settings(folder / "flight.rrd", session=f"{number:x}")
+def opened(folder: Path, *numbers: int) -> None:
+    """Small recordings, one after the other in one file."""
+    for number in numbers:
+        rrd.recorded(folder / "flight.rrd", (), session=f"{number:x}")
+
+
+def run(program: str, *words: str, **env: str) -> str:
+    command = [sys.executable, "-c", program, *words]
+    return subprocess.run(command, env=os.environ | env, capture_output=True, text=True, check=True).stdout
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
@@ -28,14 +33,9 @@ def test_many_recordings_leave_no_threads(tmp_path):
     def threads() -> set[str]:
         return {one.name for one in Path("/proc/self/task").iterdir()}
 
-    def recorded(*numbers: int) -> None:
-        for number in numbers:
-            with Recorder(settings_of(tmp_path, number)):
-                pass
-
-    recorded(0, 1)  # what is shared by all is there now
+    opened(tmp_path, 0, 1)  # what is shared by all is there now
     before = threads()
-    recorded(2, 3, 4, 5)
+    opened(tmp_path, 2, 3, 4, 5)
     eventually(lambda: threads() <= before, what="no thread of the four is left")
 
 
@@ -43,9 +43,7 @@ def test_recordings_have_the_same_paths(tmp_path):
     """The SDK forgets no path that it has seen: a drone that restarts each minute would cost 22 MB a day."""
 
     def paths(number: int) -> list[str]:
-        settings = settings_of(tmp_path, number)
-        with Recorder(settings):
-            pass
+        opened(tmp_path, number)
         whole = open_rrd(tmp_path / "flight.rrd")
         (screen,) = whole.blueprints()
         return [one.entity_path for one in whole.stream(store=screen)]
@@ -67,8 +65,7 @@ recording.log_file_from_contents("a.txt", b"a")
 recording.save(sys.argv[1])
 """
     out = tmp_path / "flight.rrd"
-    command = [sys.executable, "-c", program, str(out)]
-    subprocess.run(command, env=os.environ | {"RERUN": "off"}, capture_output=True, check=True)
+    run(program, str(out), RERUN="off")
     assert out.stat().st_size > 0
 
 
@@ -102,13 +99,7 @@ for one in threads:
     one.join()
 print("ended")
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == "ended\n"
+    assert run(program, str(tmp_path)) == "ended\n"
     assert len(list(tmp_path.glob("*.rrd"))) == 8
 
 
@@ -127,5 +118,4 @@ pyarrow.array([1, 2])
 print("pandas" in sys.modules)
 import pandas  # who wants it has it
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "False\n"
+    assert run(program) == "False\n"
