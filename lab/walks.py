@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any
 
 from hvt_common.config import load
+from hvt_common.runtime.process import leave
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.link.publisher import EdgeListener
@@ -153,4 +154,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())
