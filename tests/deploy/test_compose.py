@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import re
@@ -36,49 +37,47 @@ def compose() -> dict[str, Any]:
     return yaml.safe_load(re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text))
 
 
-def test_every_service_is_built_from_this_checkout(compose: dict[str, Any]) -> None:
-    """Without a build section Docker would look for an image of our name on the internet."""
-    assert set(compose["services"]) == {"router", "ground", "edge"}
-    for service in compose["services"].values():
+def test_every_service_is_built_from_this_checkout_of_parts_that_exist(compose: dict[str, Any]) -> None:
+    """Docker would look for an image of our name on the internet, or refuse an unknown volume or service.
+
+    The router listens without keys: published on every address it would show the cameras to the network.
+    """
+    services = compose["services"]
+    assert set(services) == {"router", "ground", "edge"}
+    for service in services.values():
         context = (DEPLOY / service["build"]["context"]).resolve()
         assert (context / service["build"]["dockerfile"]).samefile(DEPLOY / "Dockerfile")
         assert (context / "pyproject.toml").is_file()
-
-
-def test_only_this_machine_can_reach_the_router(compose: dict[str, Any]) -> None:
-    """The router listens without keys: published on every address it would show the cameras to the network."""
-    for name, service in compose["services"].items():
-        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", [])), name
-
-
-def test_the_parts_that_name_each_other_exist(compose: dict[str, Any]) -> None:
-    """Compose refuses a file with an unknown volume or service."""
-    for service in compose["services"].values():
-        assert set(service.get("depends_on", {})) <= set(compose["services"])
-        named = {volume.split(":")[0] for volume in service.get("volumes", [])}
-        assert named <= set(compose["volumes"])
+        assert set(service.get("depends_on", {})) <= set(services)
+        assert {volume.split(":")[0] for volume in service.get("volumes", [])} <= set(compose["volumes"])
         assert service["stop_signal"] == "SIGINT"
-    waited_for = compose["services"]["edge"]["depends_on"]["router"]["condition"]
-    assert waited_for == "service_healthy"
-    assert "healthcheck" in compose["services"]["router"]
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", []))
+    assert services["edge"]["depends_on"]["router"]["condition"] == "service_healthy"
+    assert "healthcheck" in services["router"]
 
 
-def test_the_commands_are_accepted_by_the_real_parsers(compose: dict[str, Any]) -> None:
+def test_the_commands_are_accepted_by_the_real_parsers(compose, monkeypatch) -> None:
     """A renamed flag would end the container with code 2."""
-    program, *arguments = compose["services"]["edge"]["command"]
-    assert program == "hvt-edge"
-    edge, _ = load(EdgeConfig, arguments, program=program, description="")
-    assert check_edge(edge).source == "demo"
-    program, *arguments = compose["services"]["ground"]["command"]
-    assert program == "hvt-ground"
-    ground, _ = load(config_class(), arguments, program=program, description="")
-    assert check_ground(ground).connect == edge.connect == ("tcp/router:7447",)
-    router = _module(DEPLOY / "router.py")
-    python, script, *arguments = compose["services"]["router"]["command"]
-    assert (python, script) == ("python", "/opt/hvt/router.py")
-    config, _ = load(router.RouterConfig, arguments, program="router", description="")
-    assert config.listen == ("tcp/0.0.0.0:7447",)
-    assert config.insecure
+    monkeypatch.syspath_prepend(DEPLOY)
+    kinds = {
+        "edge": EdgeConfig,
+        "ground": config_class(),
+        "router": importlib.import_module("router").RouterConfig,
+    }
+    programs, configs = {}, {}
+    for name, kind in kinds.items():
+        command = compose["services"][name]["command"]
+        words = 2 if name == "router" else 1
+        programs[name] = command[:words]
+        configs[name], _ = load(kind, command[words:], program=name, description="")
+    assert programs == {
+        "edge": ["hvt-edge"],
+        "ground": ["hvt-ground"],
+        "router": ["python", "/opt/hvt/router.py"],
+    }
+    assert check_edge(configs["edge"]).source == "demo"
+    assert check_ground(configs["ground"]).connect == configs["edge"].connect == ("tcp/router:7447",)
+    assert (configs["router"].listen, configs["router"].insecure) == (("tcp/0.0.0.0:7447",), True)
 
 
 def test_the_image_holds_what_the_commands_name(compose: dict[str, Any]) -> None:
@@ -142,16 +141,3 @@ def _here(word: str, *, port: int, recordings: Path) -> str:
     for inside, outside in IMAGE_PATHS.items():
         word = word.replace(inside, str(outside))
     return word.replace("/recordings", str(recordings))
-
-
-def _module(file: Path) -> Any:
-    spec = importlib.util.spec_from_file_location("hvt_router_script", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        del sys.modules[spec.name]
-    return module

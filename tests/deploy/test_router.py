@@ -113,31 +113,21 @@ def test_a_signal_ends_it_cleanly(free_port: int, how: signal.Signals) -> None:
         assert process.wait() == 0
 
 
-def _refused(*arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, str(DEPLOY / "router.py"), *arguments],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2, done.stderr
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--listen", "tcp/0.0.0.0:{free}"], "--insecure"),
+        (["--listen", "tcp/127.0.0.1:{taken}"], "in use"),
+        (["--zenoh-config", "{peer}", "--listen", "tcp/127.0.0.1:{free}"], 'mode: "router"'),
+    ],
+)
+def test_what_makes_no_router_is_a_sentence(tmp_path: Path, words: list[str], says: str) -> None:
+    """Anybody could watch the cameras; or as a peer it would run, and pass nothing on: the hardest fault to find."""
+    peer = tmp_path / "peer.json5"
+    peer.write_text('{ mode: "peer" }', encoding="utf-8")
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        named = {"free": free_ports(1)[0], "taken": other.getsockname()[1], "peer": peer}
+        command = [sys.executable, str(DEPLOY / "router.py"), *(one.format(**named) for one in words)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n"), says in done.stderr) == (2, 1, True), done.stderr
     assert "Traceback" not in done.stderr
-    assert done.stderr.count("\n") == 1
-    return done.stderr
-
-
-def test_it_does_not_open_the_network_without_keys(free_port: int) -> None:
-    """Anybody on the network could watch the cameras and ask for keyframes."""
-    assert "--insecure" in _refused("--listen", f"tcp/0.0.0.0:{free_port}")
-
-
-def test_a_port_in_use_is_a_sentence() -> None:
-    """The most likely mistake: a ground already listens there."""
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        assert "in use" in _refused("--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}")
-
-
-def test_a_configuration_that_is_no_router_is_a_sentence(tmp_path: Path, free_port: int) -> None:
-    """As a peer it would run, and pass nothing on: the hardest fault to find."""
-    file = tmp_path / "peer.json5"
-    file.write_text('{ mode: "peer" }', encoding="utf-8")
-    said = _refused("--zenoh-config", str(file), "--listen", f"tcp/127.0.0.1:{free_port}")
-    assert 'mode: "router"' in said

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import json5
 import pytest
@@ -32,81 +33,59 @@ class _Unit(configparser.RawConfigParser):
         return optionstr
 
 
-def _read(unit: Path) -> _Unit:
+def _read(unit: Path) -> configparser.SectionProxy:
+    """Its section ``Service``."""
     parsed = _Unit(delimiters=("=",), comment_prefixes=("#",), interpolation=None)
     parsed.read_string(unit.read_text(encoding="utf-8").replace("%i", INSTANCE))
-    return parsed
+    return parsed["Service"]
 
 
-def _command(unit: Path) -> list[str]:
-    return shlex.split(_read(unit)["Service"]["ExecStart"])
-
-
-def test_units_are_there() -> None:
-    """Without this, an empty folder would pass every other test of this file."""
-    assert {unit.name for unit in UNITS} == {"hvt-edge@.service", "hvt-ground.service", "hvt-router.service"}
-
-
-def test_edge_unit_starts_with_the_sample_configuration() -> None:
-    """A unit with a flag that hvt-edge does not know would end with code 2 and never be tried again."""
-    program, *arguments = _command(DEPLOY / "systemd" / "hvt-edge@.service")
-    assert program == BIN + "hvt-edge"
+@pytest.mark.parametrize(
+    ("unit", "program", "kind", "sample"),
+    [
+        ("hvt-edge@.service", "hvt-edge", EdgeConfig, f"edge-{INSTANCE}.toml"),
+        ("hvt-ground.service", "hvt-ground", config_class(), "ground.toml"),
+    ],
+)
+def test_a_unit_starts_with_the_sample_configuration(unit: str, program: str, kind: Any, sample: str) -> None:
+    """A unit with a flag that the program does not know would end with code 2 and never be tried again."""
+    command, *arguments = shlex.split(_read(DEPLOY / "systemd" / unit)["ExecStart"])
     at = arguments.index("--config") + 1
-    assert arguments[at] == f"/etc/hvt/edge-{INSTANCE}.toml"
-    arguments[at] = str(DEPLOY / "config" / "edge.toml")
-    config, _ = load(EdgeConfig, arguments, program="hvt-edge", description="")
-    assert check_edge(config).edge_id == INSTANCE
-    assert EdgeKeys(config.edge_id).edge == INSTANCE
-
-
-def test_ground_unit_starts_with_the_sample_configuration() -> None:
-    """The same for the ground."""
-    program, *arguments = _command(DEPLOY / "systemd" / "hvt-ground.service")
-    assert program == BIN + "hvt-ground"
-    at = arguments.index("--config") + 1
-    assert arguments[at] == "/etc/hvt/ground.toml"
-    arguments[at] = str(DEPLOY / "config" / "ground.toml")
-    config, _ = load(config_class(), arguments, program="hvt-ground", description="")
-    assert check_ground(config).record == Path()
+    assert (command, arguments[at]) == (BIN + program, f"/etc/hvt/{sample}")
+    arguments[at] = str(DEPLOY / "config" / sample.replace(f"-{INSTANCE}", ""))
+    config, _ = load(kind, arguments, program=program, description="")
+    if kind is EdgeConfig:
+        assert EdgeKeys(check_edge(config).edge_id).edge == INSTANCE
+    else:
+        assert check_ground(config).record == Path()
 
 
 def test_router_unit_runs_the_script_that_is_in_the_checkout() -> None:
     """The router is a script, not an installed command: a moved file would leave the unit pointing at nothing."""
-    python, script, flag, file = _command(DEPLOY / "systemd" / "hvt-router.service")
-    assert python == BIN + "python"
+    assert {unit.name for unit in UNITS} == {"hvt-edge@.service", "hvt-ground.service", "hvt-router.service"}
+    python, script, *words = shlex.split(_read(DEPLOY / "systemd" / "hvt-router.service")["ExecStart"])
+    assert (python, *words) == (BIN + "python", "--zenoh-config", "/etc/hvt/router.json5")
     assert (DEPLOY.parent / Path(script).relative_to("/opt/hvt/src")).is_file()
-    assert (flag, file) == ("--zenoh-config", "/etc/hvt/router.json5")
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
-def test_unit_stops_like_ctrl_c_and_does_not_retry_a_wrong_configuration(unit: Path) -> None:
-    """Another signal would cost the summary; retrying code 2 would fill the system log with one sentence for ever."""
-    service = _read(unit)["Service"]
-    assert service["KillSignal"] == "SIGINT"
-    assert service["Restart"] == "on-failure"
-    assert service["RestartPreventExitStatus"] == "2"
+def test_unit_begins_ends_and_writes_as_its_program_does(unit: Path) -> None:
+    """Another signal would cost the summary; retrying code 2 would fill the system log with one sentence for ever.
+
+    systemd's limit of 90 s would kill a small board that loads its networks; without AF_UNIX nobody is told that it
+    is ready; and ProtectSystem makes all but its own folder read-only.
+    """
+    service = _read(unit)
+    user = (DEPLOY / "systemd" / "hvt-sysusers.conf").read_text().splitlines()[-1].split()[1]
+    found = [
+        service[one] for one in ("KillSignal", "Restart", "RestartPreventExitStatus", "ProtectSystem", "User")
+    ]
+    assert found == ["SIGINT", "on-failure", "2", "strict", user]
     assert float(service["TimeoutStopSec"]) > 3, "a clean end may take 3 s"
-    assert (
-        service["User"] == (DEPLOY / "systemd" / "hvt-sysusers.conf").read_text().splitlines()[-1].split()[1]
-    )
-
-
-@pytest.mark.parametrize("name", ["hvt-edge@.service", "hvt-ground.service"])
-def test_unit_may_take_its_time_to_be_ready(name: str) -> None:
-    """Without it, systemd's limit of 90 s would kill a small board that loads its networks, again and again."""
-    service = _read(DEPLOY / "systemd" / name)["Service"]
-    assert (service["Type"], service["TimeoutStartSec"]) == ("notify", "infinity")
-    assert float(service["WatchdogSec"]) >= 30, "a frame each ten seconds is no loop that hangs"
-    assert "AF_UNIX" in service["RestrictAddressFamilies"], (
-        "without it nobody is told, and the start never ends"
-    )
-
-
-@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
-def test_unit_writes_where_it_may(unit: Path) -> None:
-    """ProtectSystem=strict makes all else read-only: a working directory outside loses the recording."""
-    service = _read(unit)["Service"]
-    assert service["ProtectSystem"] == "strict"
+    if unit.stem != "hvt-router":
+        assert (service["Type"], service["TimeoutStartSec"]) == ("notify", "infinity")
+        assert float(service["WatchdogSec"]) >= 30, "a frame each ten seconds is no loop that hangs"
+        assert "AF_UNIX" in service["RestrictAddressFamilies"]
     if "StateDirectory" in service:
         assert service["WorkingDirectory"] == "%S/" + service["StateDirectory"]
 
@@ -152,37 +131,32 @@ def _uncommented(sample: Path, folder: Path) -> Path:
     return file
 
 
-def test_sample_of_the_edge_is_for_a_300_kbps_radio(tmp_path: Path) -> None:
-    """The first thing an engineer copies: it must load, and leave the radio room."""
-    sample = DEPLOY / "config" / "edge.toml"
-    config, given = load(EdgeConfig, ["--config", str(sample)], program="hvt-edge", description="")
-    config = check_edge(with_profile(config, given=given.values))
-    assert config.budget_bps == 250_000
-    assert config.measures
-    assert configure(LinkSettings(role="edge", connect=config.connect))[1] == ()
-    everything, asked = load(
-        EdgeConfig, ["--config", str(_uncommented(sample, tmp_path))], program="hvt-edge", description=""
-    )
-    check_edge(everything)
-    assert {"record_base", "labels", "zenoh_config"} <= set(asked.values)
-
-
-def test_sample_of_the_ground_listens_on_this_machine_only(tmp_path: Path) -> None:
-    """Copied as it is, it must not open the machine to its network."""
-    sample = DEPLOY / "config" / "ground.toml"
-    config, _ = load(config_class(), ["--config", str(sample)], program="hvt-ground", description="")
-    config = check_ground(config)
-    settings = LinkSettings(role="ground", listen=config.listen, insecure=config.insecure)
-    assert configure(settings)[1] == ("tcp/127.0.0.1:7447",)
-    assert not config.insecure
-    everything, asked = load(
-        config_class(),
-        ["--config", str(_uncommented(sample, tmp_path))],
-        program="hvt-ground",
-        description="",
-    )
-    check_ground(everything)
-    assert {"connect", "classifier", "labels"} <= set(asked.values)
+@pytest.mark.parametrize(
+    ("name", "kind", "named"),
+    [
+        ("edge", EdgeConfig, {"record_base", "labels", "zenoh_config"}),
+        ("ground", config_class(), {"connect", "classifier", "labels"}),
+    ],
+)
+def test_a_sample_fits_a_300_kbps_radio_and_listens_here_alone(
+    tmp_path: Path, name: str, kind: Any, named: set[str]
+) -> None:
+    """The first thing an engineer copies: it must load, leave the radio room, and open no machine to its network."""
+    check: Any = check_edge if name == "edge" else check_ground
+    sample = DEPLOY / "config" / f"{name}.toml"
+    config, given = load(kind, ["--config", str(sample)], program=name, description="")
+    if name == "edge":
+        config = check(with_profile(config, given=given.values))
+        assert (config.budget_bps, config.measures) == (250_000, True)
+        assert configure(LinkSettings(role="edge", connect=config.connect))[1] == ()
+    else:
+        config = check(config)
+        assert configure(LinkSettings(role="ground", listen=config.listen))[1] == ("tcp/127.0.0.1:7447",)
+        assert not config.insecure
+    words = ["--config", str(_uncommented(sample, tmp_path))]
+    everything, asked = load(kind, words, program=name, description="")
+    check(everything)
+    assert named <= set(asked.values)
 
 
 @pytest.mark.parametrize(

@@ -79,8 +79,8 @@ def check_connection(url: str, environment: Mapping[str, str] = os.environ) -> N
             f"--cot {url} needs a certificate of this client: set {_CERT} to FILE.pem or FILE.p12 in the environment"
         )
     for name in (_CERT, _KEY, _CAFILE):
-        _check_readable(name, settings)
-    _check_key(settings)
+        if name in settings:
+            _check_file(name, Path(settings[name].replace("%%", "%")), password=_PASSWORD in settings)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -115,29 +115,19 @@ def _check_multicast(settings: Mapping[str, str]) -> None:
                 ) from None
 
 
-def _check_readable(name: str, settings: Mapping[str, str]) -> None:
-    if name not in settings:
-        return
-    path = Path(settings[name].replace("%%", "%"))
+def _check_file(name: str, path: Path, *, password: bool) -> None:
+    """OpenSSL would ask for a password at the terminal, at each connection; pytak opens a .p12 for writing."""
     try:
-        read_bytes(path)
+        data = read_bytes(path)
     except OSError as error:
         raise absent(path)(
             f"{name} {path} cannot be read ({error.strerror}): give a file that is there"
         ) from None
-
-
-def _check_key(settings: Mapping[str, str]) -> None:
-    """OpenSSL would ask for a password at the terminal, at each connection; pytak opens a .p12 for writing."""
-    for name in (_CERT, _KEY):
-        path = Path(settings.get(name, "").replace("%%", "%"))
-        if name not in settings:
-            continue
-        if path.suffix.lower() in (".p12", ".pfx"):
-            if not os.access(path, os.W_OK):
-                raise UserError(f"{name} {path} can only be read, and pytak writes to it: give a copy")
-        elif b"ENCRYPTED" in read_bytes(path) and not settings.get(_PASSWORD):
-            raise UserError(f"{name} {path} has an encrypted key: set {_PASSWORD}")
+    if name != _CAFILE and path.suffix.lower() in (".p12", ".pfx"):
+        if not os.access(path, os.W_OK):
+            raise UserError(f"{name} {path} can only be read, and pytak writes to it: give a copy")
+    elif name != _CAFILE and b"ENCRYPTED" in data and not password:
+        raise UserError(f"{name} {path} has an encrypted key: set {_PASSWORD}")
 
 
 def _settings(url: str, environment: Mapping[str, str]) -> dict[str, str]:

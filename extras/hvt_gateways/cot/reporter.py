@@ -22,9 +22,6 @@ from hvt_ground.sinks import Sink, SinkWriter
 
 _log = logging.getLogger(__name__)
 
-StillAddress = Callable[[Refinement], str]
-"""The address of a still's picture: a URL, or a file of this machine; empty without one."""
-
 _CIRCLE_95: Final = 2.448
 """Radius that holds 95 % of a circular normal distribution, in standard deviations along an axis."""
 _PLATFORM_NS: Final = SECOND_NS * 9 // 10
@@ -37,10 +34,6 @@ _LEAST_DEPRESSION_DEG: Final = 1.0
 _MOST_TRACKS: Final = 4096
 _HOW_PLATFORM, _HOW_TRACK = "m-g", "m-f"
 """A machine says it: by satellite navigation, and fused from that and from pictures."""
-
-
-def no_address(_still: Refinement) -> str:
-    return ""
 
 
 class SessionReporter(SinkWriter[Event]):
@@ -58,7 +51,7 @@ class SessionReporter(SinkWriter[Event]):
         types: TypeTable,
         clock: Callable[[], int],
         wall_ns: Callable[[], int] = time.time_ns,
-        still_address: StillAddress = no_address,
+        still_address: Callable[[Refinement], str],
     ) -> None:
         self._info = info
         self._targets = targets

@@ -59,7 +59,7 @@ class Address:
 
 
 def destination(text: str) -> Address | Path:
-    """The destination in ``--ts``, a path if it is no URL. `UserError` if it can be neither."""
+    """The destination in ``--ts``, a path if it is no URL. `UserError` if it can be neither, or not be sent to."""
     if "://" not in text:
         path = named_path(text, name="--ts")
         if path.suffix != ".ts" and not path.is_dir():
@@ -71,17 +71,12 @@ def destination(text: str) -> Address | Path:
         _ttl(parts, text)
     if parts.scheme not in ("udp", "srt") or not parts.hostname or parts.path.strip("/") or parts.username:
         raise UserError(f"--ts {address.shown} is none of what it may be: {_ACCEPTED}")
-    return address
-
-
-def check_destination(text: str | None) -> None:
-    """Refuse an impossible destination before anything is received; `UserError`."""
-    where = None if text is None else destination(text)
-    if isinstance(where, Address) and where.scheme == "srt" and not _has_srt():
+    if address.scheme == "srt" and not _has_srt():
         raise UserError(
-            f"--ts {where.shown} needs SRT, and this PyAV {av.__version__} is built without it: "
+            f"--ts {address.shown} needs SRT, and this PyAV {av.__version__} is built without it: "
             "give udp://HOST:PORT, which ffmpeg or a media server makes SRT of"
         )
+    return address
 
 
 def _split(text: str) -> SplitResult:
@@ -124,8 +119,9 @@ class Addresses:
         self._lock = threading.Lock()
         self._users: dict[str, str] = {}
 
-    def take(self, address: Address, *, edge: str) -> None:
-        """Raise `UserError` where another stream goes there."""
+    @contextmanager
+    def taken(self, address: Address, *, edge: str) -> Iterator[None]:
+        """Taken, and free again where the next steps fail; `UserError` where another stream goes there."""
         with self._lock:
             user = self._users.get(address.url)
             if user == edge:
@@ -135,20 +131,15 @@ class Addresses:
                     f"--ts {address.shown} is taken by edge {user}: put {{edge}} into it, or give a folder"
                 )
             self._users[address.url] = edge
-
-    def free(self, address: Address) -> None:
-        with self._lock:
-            self._users.pop(address.url, None)
-
-    @contextmanager
-    def taken(self, address: Address, *, edge: str) -> Iterator[None]:
-        """Taken, and free again where the next steps fail."""
-        self.take(address, edge=edge)
         try:
             yield
         except BaseException:
             self.free(address)
             raise
+
+    def free(self, address: Address) -> None:
+        with self._lock:
+            self._users.pop(address.url, None)
 
 
 class Output(Protocol):

@@ -48,9 +48,10 @@ class TransportStreamExtra(Extra[TransportStreamOptions]):
 
     def check_outputs(self, config: TransportStreamOptions) -> None:
         """Refuse a destination that is none, or cannot be sent to."""
-        from hvt_gateways.transport_stream.destination import check_destination  # noqa: PLC0415
+        if config.ts is not None:
+            from hvt_gateways.transport_stream.destination import destination  # noqa: PLC0415
 
-        check_destination(config.ts)
+            destination(config.ts)
 
     def start(self, config: TransportStreamOptions, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """Make the function that opens the stream of a session."""

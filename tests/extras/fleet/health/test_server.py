@@ -8,6 +8,7 @@ import json
 import socket
 import threading
 import time
+from contextlib import contextmanager
 from http.server import HTTPServer
 from socketserver import ThreadingMixIn
 
@@ -22,7 +23,7 @@ from hvt_fleet.health.server import Answer, HealthServer
 from hvt_fleet.health.status_command import StatusCommand
 from programs.processes import answers, eventually, free_ports
 
-STATE = {"/state.json": lambda: Answer(json.dumps({"latitude_deg": 52.1}).encode())}
+STATE = Answer(json.dumps({"latitude_deg": 52.1}).encode())
 
 
 def asked(port: int, host: str | None) -> int:
@@ -44,14 +45,8 @@ def asked(port: int, host: str | None) -> int:
             "127.0.0.1",
             ("127.0.0.1", "LOCALHOST:9", "[::1]:9", None),
             (
-                "evil.example",
-                "127.evil.example:9",
-                "127.0.0.1.evil.example",
-                "192.0.2.7",
-                "[",
-                "[::1].evil.example",
-                "",
-                "a, b",
+                *("evil.example", "127.evil.example:9", "127.0.0.1.evil.example", "192.0.2.7"),
+                *("[", "[::1].evil.example", "", "a, b"),
             ),
         ),
         (
@@ -63,29 +58,23 @@ def asked(port: int, host: str | None) -> int:
 )
 def test_state_is_told_under_names_of_this_machine_alone(served_at, names, strangers):
     """Another site could have its name lead here, and its page would read where the drone is."""
-    (port,) = free_ports(1)
-    with HealthServer(f"{served_at}:{port}", STATE, failures=Failures(time.time_ns)):
-        eventually(lambda: answers(port), what="it serves")
+    with serving(at=served_at) as port:
         assert {one: asked(port, one) for one in names} == dict.fromkeys(names, 200)
         assert {one: asked(port, one) for one in strangers} == dict.fromkeys(strangers, 403)
 
 
 def test_a_probe_may_ask_by_head():
     """`curl -I` and load balancers were told 501, and took a ground that is well for one that is down."""
-    (port,) = free_ports(1)
-    with HealthServer(f"127.0.0.1:{port}", STATE, failures=Failures(time.time_ns)):
-        eventually(lambda: answers(port), what="it serves")
+    with serving() as port:
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
         connection.request("HEAD", "/state.json")
-        answer = connection.getresponse()
-        length = len(STATE["/state.json"]().body)
-        assert (answer.status, answer.headers["Content-Length"], answer.read()) == (200, str(length), b"")
+        answer, length = connection.getresponse(), str(len(STATE.body))
+        assert (answer.status, answer.headers["Content-Length"], answer.read()) == (200, length, b"")
         connection.close()
 
 
 def test_threads_and_descriptors_that_are_used_up_for_a_while(monkeypatch):
     """The port would answer nobody for the rest of the flight, or take a core from video."""
-    (port,) = free_ports(1)
     started, taken = ThreadingMixIn.process_request, HTTPServer.get_request
     refused, full = [], []
 
@@ -103,8 +92,7 @@ def test_threads_and_descriptors_that_are_used_up_for_a_while(monkeypatch):
 
     monkeypatch.setattr(ThreadingMixIn, "process_request", start)
     monkeypatch.setattr(HTTPServer, "get_request", take)
-    with HealthServer(f"127.0.0.1:{port}", STATE, failures=Failures(time.time_ns)):
-        eventually(lambda: answers(port), what="it serves")
+    with serving() as port:
         while len(refused) < 20:
             answers(port)
         assert [asked(port, None) for _ in range(20)] == [200] * 20
@@ -112,26 +100,22 @@ def test_threads_and_descriptors_that_are_used_up_for_a_while(monkeypatch):
 
 
 @pytest.mark.parametrize(("main", "port"), [(hvt_edge.cli.main, 9465), (hvt_ground.cli.main, 9464)])
-def test_status_at_what_is_no_address(main, port, capsys):
-    """A script would wait for a program to come where none can be."""
+def test_what_is_no_address_is_told_the_one_that_status_asks(main, port, capsys):
+    """A script would wait for a program to come where none can be; or metrics be where no `status` finds them."""
     assert main(["status", "--at", "here:99999"]) == 2
     said = f"--at 'here:99999' is not accepted: give HOST:PORT, such as 127.0.0.1:{port}\n"
     assert capsys.readouterr().err.partition(": ")[2] == said
-
-
-def test_a_wrong_address_is_told_the_one_that_status_asks():
-    """Who took the edge's advice had metrics at 9464, and `hvt-edge status` found no edge."""
     with pytest.raises(UserError, match=r"give HOST:PORT, such as .*, 127\.0\.0\.1:9465 for an edge"):
-        HealthServer("here", STATE, failures=Failures(time.time_ns))
+        HealthServer("here", {}, failures=Failures(time.time_ns))
 
 
-def serving(port, answer):
-    """A program's port that answers so."""
-    return HealthServer(
-        f"127.0.0.1:{port}",
-        {"/state.json": lambda: answer},
-        failures=Failures(time.time_ns),
-    )
+@contextmanager
+def serving(answer=STATE, *, at="127.0.0.1"):
+    """The port of a program that answers so, once it does."""
+    (port,) = free_ports(1)
+    with HealthServer(f"{at}:{port}", {"/state.json": lambda: answer}, failures=Failures(time.time_ns)):
+        eventually(lambda: answers(port), what="it serves")
+        yield port
 
 
 def status(port, *words):
@@ -149,20 +133,18 @@ def test_status_says_brackets_as_they_are_and_asks_no_proxy(monkeypatch, capsys)
     """A part that fails with an address in brackets ended it in a traceback; beside a proxy no edge was there."""
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
     reason = "[/dev/video0] is busy, tcp/[fe80::1]:7447 too"
-    (port,) = free_ports(1)
-    with serving(port, Answer(json.dumps({"reason": reason}).encode())):
-        eventually(lambda: answers(port), what="it serves")
+    with serving(Answer(json.dumps({"reason": reason}).encode())) as port:
         assert status(port) == 0
     assert reason in capsys.readouterr().out
 
 
 def test_status_says_what_a_program_says_that_stands_still():
     """An operator would start a second edge beside one that hangs."""
-    (port,) = free_ports(1)
-    with serving(port, Answer(b"it stands still\n", status=503)):
-        eventually(lambda: answers(port), what="it serves")
-        with pytest.raises(FlightError, match=f"what answers at 127.0.0.1:{port} says: it stands still"):
-            status(port)
+    with (
+        serving(Answer(b"it stands still\n", status=503)) as port,
+        pytest.raises(FlightError, match=f"what answers at 127.0.0.1:{port} says: it stands still"),
+    ):
+        status(port)
 
 
 def test_status_at_a_port_that_speaks_no_http():

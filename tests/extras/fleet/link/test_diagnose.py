@@ -17,6 +17,7 @@ from typing import cast
 
 import pytest
 import zenoh
+from cryptography.hazmat.primitives import serialization
 
 from hvt_common.errors import UserError
 from hvt_common.transport.link_doctor import Rights
@@ -29,6 +30,8 @@ from hvt_fleet.pki import authority
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.outsider import joined
 from programs.processes import eventually, free_ports
+
+NEEDS_IPV6 = pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this machine has no IPv6")
 
 
 @pytest.fixture(scope="module")
@@ -76,71 +79,46 @@ def _server(answer: bytes | None) -> Iterator[int]:
 # Probes of what is not Zenoh. Those of Zenoh with one fault each are in tests/integration/hostile/test_security.py.
 
 
-@pytest.mark.parametrize(
-    ("answer", "says"),
-    [
-        (b"SSH-2.0-OpenSSH_9.2\r\n", "does not speak TLS: connect to tcp/127.0.0.1:"),
-        (b"", "does not speak TLS: connect to tcp/127.0.0.1:"),
-        (
-            None,
-            "does not answer TLS within 3 s: it is a plain tcp/… port, its program stands still, or the link",
-        ),
-    ],
-    ids=["another protocol", "hangs up", "silent"],
+SILENT = (
+    "somebody listens there and says nothing: a tunnel or proxy whose line is dark, or a side of HVT that stands "
+    "still?"
 )
-def test_a_port_without_tls(fleet: Fleet, answer: bytes | None, says: str) -> None:
-    """Somebody's other service on the port: the user would search among the certificates."""
+DEAF = "does not answer TLS within 3 s: it is a plain tcp/… port, its program stands still, or the link"
+NO_TLS = "what listens there does not speak TLS: connect to tcp/127.0.0.1:"
+NOBODY = "nobody listens on port {free} there: is the other side running?"
+
+
+@pytest.mark.parametrize(
+    ("answer", "endpoint", "says"),
+    [
+        (b"SSH-2.0-OpenSSH_9.2\r\n", "tls/127.0.0.1:{port}", NO_TLS),
+        (b"", "tls/127.0.0.1:{port}", NO_TLS),
+        (None, "tls/127.0.0.1:{port}", DEAF),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "tcp/127.0.0.1:{port}", "no Zenoh link comes of it"),
+        (None, "tcp/127.0.0.1:{port}", SILENT),
+        (b"", "tcp/127.0.0.1:{free}", NOBODY),
+        (b"", "tls/127.0.0.1:{free}", NOBODY),
+        pytest.param(b"", "tcp/[::1]:{free}", NOBODY, marks=NEEDS_IPV6),
+        (b"", "tls/no-such-host.invalid:7447", "no machine of the name 'no-such-host.invalid' is known here"),
+        (
+            b"",
+            "quic/no-such-host.invalid:7447",
+            "no machine of the name 'no-such-host.invalid' is known here",
+        ),
+        (b"", f"tcp/{'a' * 64}:7447", f"'{'a' * 64}' is no name that a machine can have"),
+        (b"", "tcp/base..example:7447", "'base..example' is no name that a machine can have"),
+        (b"", "udp/127.0.0.1:7447", "cannot be seen from outside"),
+    ],
+)
+def test_what_is_no_ground_is_said(
+    fleet: Fleet, free_port: int, answer: bytes | None, endpoint: str, says: str
+) -> None:
+    """Somebody's other service, a typing error, a ground that swaps: the user would search among the certificates."""
     with _server(answer) as port:
-        said = why_no_link(f"tls/127.0.0.1:{port}", _files(fleet))
-    assert said.startswith(f"tls/127.0.0.1:{port}: what listens there ")
-    assert says in said
-
-
-def test_a_plain_endpoint_that_is_something_else(fleet: Fleet) -> None:
-    """A web server on the port is no ground, and says nothing that Zenoh would pass on."""
-    with _server(b"HTTP/1.1 400 Bad Request\r\n\r\n") as port:
-        assert "no Zenoh link comes of it" in why_no_link(f"tcp/127.0.0.1:{port}", TlsFiles())
-
-
-def test_a_ground_that_stands_still_is_not_called_something_else() -> None:
-    """A ground that swaps for a moment would send its user to look for a wrong address."""
-    with _server(None) as port:
-        said = why_no_link(f"tcp/127.0.0.1:{port}", TlsFiles())
-    assert said.endswith(
-        "somebody listens there and says nothing: a tunnel or proxy whose line is dark, or a side of HVT "
-        "that stands still?"
-    )
-
-
-@pytest.mark.parametrize("protocol", ["tcp", "tls"])
-def test_nobody_there(fleet: Fleet, protocol: str, free_port: int) -> None:
-    """The most frequent of all: the ground is not running yet."""
-    said = why_no_link(f"{protocol}/127.0.0.1:{free_port}", _files(fleet))
-    assert said == (
-        f"{protocol}/127.0.0.1:{free_port}: nobody listens on port {free_port} there: is the other side running?"
-    )
-    assert (
-        "nobody listens" in why_no_link(f"{protocol}/[::1]:{free_port}", _files(fleet)) or not socket.has_ipv6
-    )
-
-
-def test_a_name_that_nobody_has(fleet: Fleet) -> None:
-    """A typing error in the host is to be seen as one."""
-    said = why_no_link("tls/no-such-host.invalid:7447", _files(fleet))
-    assert "no machine of the name 'no-such-host.invalid' is known here" in said
-
-
-@pytest.mark.parametrize("host", ["a" * 64, "base..example"])
-def test_a_name_that_nobody_can_have(host: str) -> None:
-    """The thread that explains the link would end, and with it every later explanation."""
-    said = why_no_link(f"tcp/{host}:7447", TlsFiles())
-    assert said == f"tcp/{host}:7447: {host!r} is no name that a machine can have"
-
-
-def test_what_cannot_be_probed_says_so(fleet: Fleet) -> None:
-    """UDP has no connection to refuse: silence would look like a diagnosis that forgot."""
-    assert "cannot be seen from outside" in why_no_link("udp/127.0.0.1:7447", _files(fleet))
-    assert "no machine of the name" in why_no_link("quic/no-such-host.invalid:7447", _files(fleet))
+        named = {"port": port, "free": free_port}
+        said = why_no_link(endpoint.format(**named), _files(fleet))
+    assert said.startswith(f"{endpoint.format(**named)}: ")
+    assert says.format(**named) in said
 
 
 def test_of_a_name_without_connections_the_address_that_is_tried_is_said(monkeypatch) -> None:
@@ -345,28 +323,58 @@ def _start(fleet: Fleet, file: Path, *, name: str = "uav-1", listen: bool = Fals
         pass
 
 
-@pytest.mark.parametrize("side", ["connect", "listen"])
-@pytest.mark.parametrize("part", ["certificate", "private_key"])
-def test_a_file_that_is_missing_is_named_with_its_setting(fleet: Fleet, side: str, part: str) -> None:
-    """Zenoh would go on trying for ever, without a word."""
-    setting = f"{side}_{part}"
-    file = fleet.changed("uav-1", **{setting: "/nowhere/x.pem"})
-    with pytest.raises(
-        UserError, match=rf"^/nowhere/x.pem, the {setting} of --zenoh-config, cannot be read \(No such"
-    ):
-        _start(fleet, file, listen=side == "listen")
-    file = fleet.changed("uav-1", **{setting: None})
-    with pytest.raises(UserError, match=rf"but no {setting}: give both"):
-        _start(fleet, file, listen=side == "listen")
+BASE_KEY, TEXT, LOCKED = "base.key", "text.pem", "locked.key"
 
 
-def test_a_listener_without_keys_is_refused(fleet: Fleet) -> None:
-    """Zenoh's own words for it are those of a library."""
-    file = fleet.changed("uav-1", listen_certificate=None, listen_private_key=None)
-    with pytest.raises(
-        UserError, match=r"listening on tls/127.0.0.1:9 takes listen_certificate and listen_private"
-    ):
-        _start(fleet, file, listen=True)
+@pytest.mark.parametrize(
+    ("changes", "listen", "words"),
+    [
+        *(
+            row
+            for setting in (
+                "connect_certificate",
+                "connect_private_key",
+                "listen_certificate",
+                "listen_private_key",
+            )
+            for row in (
+                (
+                    {setting: "/nowhere/x.pem"},
+                    setting.startswith("listen"),
+                    rf"^/nowhere/x.pem, the {setting} of --zenoh-config, cannot be read \(No such",
+                ),
+                ({setting: None}, setting.startswith("listen"), f"but no {setting}: give both"),
+            )
+        ),
+        (
+            {"listen_certificate": None, "listen_private_key": None},
+            True,
+            r"listening on tls/127.0.0.1:9 takes listen_certificate and listen_private",
+        ),
+        ({"connect_private_key": BASE_KEY}, False, r"uav-1.pem and .*base.key do not belong together"),
+        ({"connect_certificate": TEXT}, False, "are not a certificate and its key in PEM"),
+        (
+            {"root_ca_certificate": TEXT},
+            False,
+            "root_ca_certificate of --zenoh-config, holds no certificate in PEM",
+        ),
+        ({"connect_private_key": LOCKED}, False, "this key is encrypted; a key without a password is needed"),
+    ],
+)
+def test_keys_that_cannot_be_used_are_named(fleet: Fleet, changes: dict, listen, words: str) -> None:
+    """Zenoh would go on trying for ever without a word, or a service wait on a terminal that it does not have."""
+    (fleet.folder / TEXT).write_text("no key at all")
+    key = serialization.load_pem_private_key((fleet.folder / "uav-1.key").read_bytes(), None)
+    locked = serialization.BestAvailableEncryption(b"secret")
+    (fleet.folder / LOCKED).write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, locked)
+    )
+    ours = {
+        name: str(fleet.folder / value) if value in (BASE_KEY, TEXT, LOCKED) else value
+        for name, value in changes.items()
+    }
+    with pytest.raises(UserError, match=words):
+        _start(fleet, fleet.changed("uav-1", **ours), listen=listen)
 
 
 def test_keys_that_others_can_read_are_warned_of(
@@ -394,39 +402,6 @@ def test_a_key_that_this_user_cannot_read_is_named(fleet: Fleet, tmp_path: Path)
         _start(other, other.file("uav-1"))
 
 
-def test_another_machines_key_does_not_pass(fleet: Fleet, tmp_path: Path) -> None:
-    """Half of a copy: the certificate of one machine and the key of another."""
-    file = fleet.changed("uav-1", connect_private_key=str(fleet.folder / "base.key"))
-    with pytest.raises(UserError, match=r"uav-1.pem and .*base.key do not belong together"):
-        _start(fleet, file)
-    text = tmp_path / "text.pem"
-    text.write_text("no key at all")
-    file = fleet.changed("uav-1", connect_certificate=str(text))
-    with pytest.raises(UserError, match="are not a certificate and its key in PEM"):
-        _start(fleet, file)
-    file = fleet.changed("uav-1", root_ca_certificate=str(text))
-    with pytest.raises(UserError, match="root_ca_certificate of --zenoh-config, holds no certificate in PEM"):
-        _start(fleet, file)
-
-
-def test_an_encrypted_key_does_not_ask_for_its_password(fleet: Fleet, tmp_path: Path) -> None:
-    """A service would wait on a terminal that it does not have."""
-    from cryptography.hazmat.primitives import serialization
-
-    plain = (fleet.folder / "uav-1.key").read_bytes()
-    locked = tmp_path / "locked.key"
-    locked.write_bytes(
-        serialization.load_pem_private_key(plain, None).private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.BestAvailableEncryption(b"secret"),
-        )
-    )
-    file = fleet.changed("uav-1", connect_private_key=str(locked))
-    with pytest.raises(UserError, match="this key is encrypted; a key without a password is needed"):
-        _start(fleet, file)
-
-
 def test_an_expired_certificate_is_refused_here_not_there(fleet: Fleet, tmp_path: Path) -> None:
     """Two years after delivery: the one day on which nobody remembers certificates."""
     other = fleet.copy(tmp_path / "old")
@@ -441,16 +416,15 @@ def test_a_clock_that_is_behind_is_warned_of_and_tried(
     fleet: Fleet, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A drone without a clock of its own starts in the past and learns the time later: it must not stay down."""
-    import datetime as dt
-
-    other = fleet.copy(tmp_path / "young")
-    other.reissue("uav-1", now=dt.datetime.now(dt.UTC) + dt.timedelta(days=5))
-    _start(other, other.file("uav-1"))
-    assert re.search(r"uav-1.pem: this certificate holds from .* is the clock right\?", caplog.text)
-    caplog.clear()
-    other.reissue("uav-1", now=dt.datetime.now(dt.UTC) - dt.timedelta(days=810))
-    _start(other, other.file("uav-1"))
-    assert "this certificate expires on" in caplog.text
+    other, now = fleet.copy(tmp_path / "young"), dt.datetime.now(dt.UTC)
+    for days, said in (
+        (5, r"certificate holds from .* is the clock right\?"),
+        (-810, "certificate expires on"),
+    ):
+        caplog.clear()
+        other.reissue("uav-1", now=now + dt.timedelta(days=days))
+        _start(other, other.file("uav-1"))
+        assert re.search(f"uav-1.pem: this {said}", caplog.text)
 
 
 def test_an_edge_that_is_not_who_its_certificate_says_is_told(fleet: Fleet) -> None:
@@ -481,37 +455,31 @@ def test_a_certificate_reads_the_same_from_both_ends(fleet: Fleet) -> None:
 # Rights
 
 
-def _rights(text: str) -> Rights:
-    config = zenoh.Config()
-    config.insert_json5("access_control", text)
-    return Rights.of(config)
-
-
-def test_without_access_control_everything_is_allowed() -> None:
-    """A plain configuration must not be called one without rights."""
-    rights = Rights.of(configure(LinkSettings("ground"))[0])
-    assert rights.knows("anybody")
-    assert rights.allow("anybody", flow="ingress", message="put", key="hvt/uav-1/base")
-    assert rights.allow_somebody(flow="egress", message="query", key="hvt/uav-1/control")
-
-
 def test_rights_are_read_as_zenoh_reads_them() -> None:
-    """A rule read too kindly gives no warning, one read too strictly a false one."""
-    rights = _rights(
+    """A rule read too kindly gives no warning, one read too strictly a false one; without rules all is allowed."""
+    config, _ = configure(LinkSettings("ground"))
+    plain = Rights.of(config)
+    config.insert_json5(
+        "access_control",
         """{ enabled: true, default_permission: "deny",
              subjects: [{ id: "a", cert_common_names: ["a", "b"] }, { id: "all" }],
              rules: [
                { id: "r", permission: "allow", flows: ["ingress"], messages: ["put"], key_exprs: ["hvt/*/base"] },
                { id: "no", permission: "deny", flows: ["ingress"], messages: ["put"], key_exprs: ["hvt/x/**"] },
                { id: "q", permission: "allow", messages: ["query"], key_exprs: ["**"] }],
-             policies: [{ subjects: ["a"], rules: ["r", "no"] }, { subjects: ["all"], rules: ["q"] }] }"""
+             policies: [{ subjects: ["a"], rules: ["r", "no"] }, { subjects: ["all"], rules: ["q"] }] }""",
     )
-    assert rights.allow("b", flow="ingress", message="put", key="hvt/y/base")
-    assert not rights.allow("b", flow="ingress", message="put", key="hvt/x/base"), (
-        "a refusal goes before a permission"
-    )
-    assert not rights.allow("b", flow="egress", message="put", key="hvt/y/base")
-    assert not rights.allow("c", flow="ingress", message="put", key="hvt/y/base")
-    for flow in ("ingress", "egress"):  # no flow said: both
-        assert rights.allow("c", flow=flow, message="query", key="hvt/y/control")
+    rights = Rights.of(config)
+    for who, flow, message, key, allowed in (
+        ("b", "ingress", "put", "hvt/y/base", True),
+        ("b", "ingress", "put", "hvt/x/base", False),  # a refusal goes before a permission
+        ("b", "egress", "put", "hvt/y/base", False),
+        ("c", "ingress", "put", "hvt/y/base", False),
+        ("c", "ingress", "query", "hvt/y/control", True),  # no flow said: both
+        ("c", "egress", "query", "hvt/y/control", True),
+    ):
+        assert rights.allow(who, flow=flow, message=message, key=key) is allowed, (who, flow, message, key)
+        assert plain.allow(who, flow=flow, message=message, key=key)
     assert rights.knows("c"), "the subject without names is everybody"
+    assert plain.knows("anybody")
+    assert plain.allow_somebody(flow="egress", message="query", key="hvt/uav-1/control")

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self
 
 import pytest
@@ -289,8 +289,13 @@ def test_events_go_over_tls_with_the_certificate_of_the_client(port, fleet):
 
 
 @pytest.mark.parametrize("password", ["atakatak", "50%%s=${x}"])
-def test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, password):
-    """It is what the administrator of a TAK server hands out, with a password of his taste."""
+def test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, password, monkeypatch):
+    """It is what the administrator of a TAK server hands out, with a password of his taste.
+
+    pytak unpacks it into files: whoever else is on this machine could take part.
+    """
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    (tmp_path / "tmp").mkdir()
     certificate = load_pem_x509_certificate((fleet.folder / "client.pem").read_bytes())
     key: Any = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
     store = tmp_path / "client.p12"
@@ -310,14 +315,22 @@ def test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, password):
         connection.log(message("secret"))
         eventually(lambda: server.uids == ["secret"], what="it is sent")
         connection.close()
+    assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_certificate_and_key_may_be_in_one_file(port, fleet, tmp_path):
-    """As many programs write them."""
+def test_certificate_and_locked_key_may_be_in_one_file(fleet, tmp_path):
+    """As many programs write them; OpenSSL would ask for the password at the terminal, and the ground wait."""
+    key: Any = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
+    locked = serialization.BestAvailableEncryption(b"atakatak")
     both = tmp_path / "both.pem"
-    both.write_bytes(b"".join((fleet.folder / f"client.{one}").read_bytes() for one in ("key", "pem")))
+    both.write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, locked)
+        + (fleet.folder / "client.pem").read_bytes()
+    )
     said = keys(fleet, TLS_CLIENT_CERT=str(both), TLS_CLIENT_KEY="")
-    check_connection(f"tls://127.0.0.1:{port}", said)
+    with pytest.raises(UserError, match=r"both\.pem has an encrypted key: set PYTAK_TLS_CLIENT_PASSWORD"):
+        check_connection("tls://takserver.example:8089", said)
+    check_connection("tls://takserver.example:8089", {**said, "PYTAK_TLS_CLIENT_PASSWORD": "atakatak"})
 
 
 @pytest.mark.parametrize(
@@ -389,22 +402,6 @@ def test_keys_that_cannot_be_used_end_the_start(fleet, tmp_path, changes, senten
     assert sentence in str(refusal.value)
 
 
-def test_a_key_that_needs_a_password_is_asked_for_it_once(fleet, tmp_path):
-    """OpenSSL would ask at the terminal, and the ground would wait for an answer."""
-    key: Any = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
-    locked = key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.BestAvailableEncryption(b"atakatak"),
-    )
-    path = tmp_path / "locked.key"
-    path.write_bytes(locked)
-    said = keys(fleet, TLS_CLIENT_KEY=str(path))
-    with pytest.raises(UserError, match=r"has an encrypted key: set PYTAK_TLS_CLIENT_PASSWORD"):
-        check_connection("tls://takserver.example:8089", said)
-    check_connection("tls://takserver.example:8089", {**said, "PYTAK_TLS_CLIENT_PASSWORD": "atakatak"})
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [("TTL", "far"), ("TTL", "128"), ("LOCAL_ADDR", "eth0"), ("LOCAL_ADDRS", "192.0.2.1, ::1")],
@@ -414,14 +411,6 @@ def test_settings_of_multicast_that_cannot_be_used_end_the_start(name, value):
     with pytest.raises(UserError, match=f"PYTAK_MULTICAST_{name} '{value}' is not accepted"):
         check_connection("udp://239.2.3.1:6969", {f"PYTAK_MULTICAST_{name}": value})
     check_connection("udp://239.2.3.1:6969", {"PYTAK_MULTICAST_LOCAL_ADDRS": "192.0.2.1, 192.0.2.2"})
-
-
-def test_no_private_key_is_left_behind(port, fleet, tmp_path, monkeypatch):
-    """Whoever else is on this machine could take part: pytak unpacks a keystore into files."""
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
-    (tmp_path / "tmp").mkdir()
-    test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, "x")
-    assert list(Path(tmp_path / "tmp").iterdir()) == []
 
 
 def test_a_group_without_a_route_names_the_remedy(monkeypatch):
@@ -440,16 +429,8 @@ def test_a_group_without_a_route_names_the_remedy(monkeypatch):
 def test_nothing_goes_stale_between_two_tries():
     """A server that cuts one connection would show no camera for most of a minute."""
     pauses_s: list[float] = []
-
-    class Opened:
-        """Outputs that tell how long a target is left alone."""
-
-        def open(self, _part: str, _open_sink: object, *, longest_pause_s: float) -> None:
-            """Note it."""
-            pauses_s.append(longest_pause_s)
-
-    config = CotOptions(cot=("tcp://127.0.0.1:1",))
-    CotExtra().start(config, Opened())  # type: ignore[arg-type]
+    outputs: Any = SimpleNamespace(open=lambda *_, longest_pause_s: pauses_s.append(longest_pause_s))
+    CotExtra().start(CotOptions(cot=("tcp://127.0.0.1:1",)), outputs)
     assert 3 * pauses_s[0] <= STALE_NS / 1e9
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -19,17 +20,13 @@ from rigs import examples
 
 def test_a_ground_that_was_killed_leaves_all_but_the_last_moment(tmp_path: Path) -> None:
     """On a link of 40 kbps a minute of the flight would be missing, or the file be empty."""
-    path = tmp_path / "flight.mcap"
-    file = McapFile(path, edge="uav-1")
+    file = McapFile(tmp_path / "flight.mcap", edge="uav-1")
     for index in range(200):
         file.log(Notice(index, index, "info", f"{index} " + "x" * 1000))
     found = 0
-    with path.open("rb") as killed:  # as it is now: nobody closes it
-        try:
-            for _ in NonSeekingReader(killed).iter_messages(log_time_order=False):
-                found += 1
-        except Exception:  # noqa: BLE001 - it breaks off
-            pass
+    with file.path.open("rb") as killed, suppress(Exception):  # as it is now: nobody closes it, it breaks off
+        for _ in NonSeekingReader(killed).iter_messages(log_time_order=False):
+            found += 1
     assert 200 - found <= 32
     file.close()
 

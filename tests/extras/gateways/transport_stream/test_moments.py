@@ -115,11 +115,5 @@ def test_metadata_neither_goes_back_nor_far_ahead():
     """The muxer refuses the first; a receiver would wait for the second."""
     line = Timeline(fps=15)
     line.picture(0)
-    assert [line.metadata(one) for one in (0, 0, 6_000, 3_000, 90_000 * 11, 12_000)] == [
-        True,
-        False,
-        True,
-        False,
-        False,
-        True,
-    ]
+    order = [line.metadata(one) for one in (0, 0, 6_000, 3_000, 90_000 * 11, 12_000)]
+    assert order == [True, False, True, False, False, True]

@@ -242,7 +242,8 @@ def live(events, patience_s: int) -> ReadStream:
     stream.close()
     player.join(60)
     assert len(found) == 1, "the player ended"
-    addresses.take(Address(f"udp://127.0.0.1:{port}"), edge="uav-2")
+    with addresses.taken(Address(f"udp://127.0.0.1:{port}"), edge="uav-2"):
+        pass  # it is free again
     return found[0]
 
 
@@ -265,27 +266,24 @@ def test_nobody_on_udp_costs_nothing(events, caplog):
     assert len(caplog.messages) <= 1
 
 
-def test_a_second_edge_is_refused_until_the_first_has_ended(events):
-    """Two streams at one port are none."""
-    (port,) = free_ports(1)
-    address, addresses = Address(f"udp://127.0.0.1:{port}"), Addresses()
+def test_a_second_edge_is_refused_until_the_first_has_ended():
+    """Two streams at one port are none; and a name that resolves a minute later would stay refused."""
+    addresses = Addresses()
 
-    def opened(edge: str) -> TransportStream:
-        return live_stream(address, platform=replace(PLATFORM, edge=edge), fps=15, addresses=addresses)
+    def opened(edge: str, host: str = f"127.0.0.1:{free_ports(1)[0]}") -> TransportStream:
+        platform = replace(PLATFORM, edge=edge)
+        return live_stream(Address(f"udp://{host}"), platform=platform, fps=15, addresses=addresses)
 
     first = opened("uav-1")
-    with pytest.raises(UserError, match="taken by edge uav-1"):
+    with pytest.raises(UserError, match=r"taken by edge uav-1: put \{edge\} into it"):
         opened("uav-2")
+    with pytest.raises(UserError, match="still taken by the session before"):
+        opened("uav-1")
     first.close()
     opened("uav-2").close()
-
-
-def test_an_address_that_cannot_be_used_is_free_again():
-    """A name that resolves a minute later would stay refused."""
-    address, addresses = Address("udp://nowhere.invalid:5600"), Addresses()
     for _ in range(2):
         with pytest.raises(UserError, match="has no host that can be found"):
-            live_stream(address, platform=PLATFORM, fps=15, addresses=addresses)
+            opened("uav-1", "nowhere.invalid:5600")
 
 
 def test_metadata_is_carried_in_one_of_the_two_ways_of_the_standard(events, tmp_path):

@@ -210,19 +210,15 @@ def test_tracks_come_back_with_id_class_confidence_box_and_place():
     assert found.items[24] + offsets[1] == pytest.approx(151.2512, abs=2e-5)
 
 
-def test_boxes_at_the_edge_stay_in_the_picture():
-    """A pixel number beyond the last line is none."""
-    boxes = np.array([[0, 0, 1280, 720], [-5, -5, 2000, 2000]], np.float32)
-    found = said(None, replace(overlay(2), boxes_base_px=boxes)).targets
-    assert [(one.number(2), one.number(3)) for one in found] == [(1, 1280 * 720)] * 2
-
-
 def test_a_track_has_a_place_only_where_there_is_one():
-    """At the horizon, or without a pose, none is known."""
+    """At the horizon, or without a pose, none is known; a pixel number beyond the last line is none."""
     places = np.array([[math.nan, math.nan], [-33.499, 151.2512]])
     found = said(POSE, overlay(2, places=Places(places, np.ones((2, 3))))).targets
     assert [{10, 11} <= set(one.items) for one in found] == [False, True]
     assert not any({10, 11} & set(one.items) for one in said(None, overlay(2)).targets)
+    boxes = np.array([[0, 0, 1280, 720], [-5, -5, 2000, 2000]], np.float32)
+    found = said(None, replace(overlay(2), boxes_base_px=boxes)).targets
+    assert [(one.number(2), one.number(3)) for one in found] == [(1, 1280 * 720)] * 2
     across = replace(POSE, longitude_deg=-179.9999)
     date_line = overlay(1, places=Places(np.array([[-33.499, 179.9999]]), np.ones((1, 3))))
     (target,) = said(across, date_line).targets
@@ -230,19 +226,14 @@ def test_a_track_has_a_place_only_where_there_is_one():
 
 
 def test_what_stills_doubt_is_counted_and_not_reported():
-    """What is known to be nothing would be shown as a target."""
+    """What is known to be nothing would be shown as a target; and no targets not be told from no detector."""
     found = said(POSE, overlay(3, doubted=np.array([False, True, False])))
     assert found.vmti is not None
     assert (found.vmti[5], found.vmti[6]) == (b"\x03", b"\x02")
     assert [one.track_id for one in found.targets] == [200, 202]
-
-
-def test_nothing_in_the_picture_is_said_too():
-    """Nobody could tell it from a detector that has failed."""
-    found = said(POSE, overlay(0, places=None))
-    assert found.vmti is not None
-    assert found.vmti[5] == b"\x00"
-    assert 101 not in found.vmti
+    nothing = said(POSE, overlay(0, places=None)).vmti
+    assert nothing is not None
+    assert (nothing[5], 101 in nothing) == (b"\x00", False)
 
 
 def test_of_too_many_tracks_the_surest_are_reported():
@@ -262,6 +253,11 @@ def test_any_time_can_be_said(capture_ns):
     assert uas_local_set(PLATFORM, capture_ns=capture_ns, pose=None, overlay=overlay(1))
 
 
+LENGTHS = {0: "00", 127: "7f", 128: "8180", 256: "820100", 65_536: "83010000"}
+IDENTIFIERS = {0: "00", 127: "7f", 128: "8100", 16_384: "818000"}
+WHOLE = {0: "00", 255: "ff", 256: "0100", 1 << 40: "010000000000"}
+
+
 @pytest.mark.parametrize(
     ("data", "code"),
     [  # the examples of ST 0601, by item
@@ -277,6 +273,9 @@ def test_any_time_can_be_said(capture_ns):
         ("f101a229", signed(-10.542388633146132, 90, size=4)),  # 23
         ("2a94", imapb(10_000, -900, 19_000, size=2)),  # ST 0903, VTarget item 12
         ("3a6667", imapb(10, -19.2, 19.2, size=3)),  # VTarget item 10
+        *((code, ber_length(size)) for size, code in LENGTHS.items()),
+        *((code, ber_oid(number)) for number, code in IDENTIFIERS.items()),
+        *((code, whole(number)) for number, code in WHOLE.items()),
     ],
 )
 def test_the_examples_of_the_standards(data, code):
@@ -316,26 +315,6 @@ def test_what_is_out_of_range_is_not_another_number(value):
     assert unsigned(value + 380, 0, 360, size=2) in (b"", unsigned(359.999, 0, 360, size=2))
     assert unsigned(math.nan, 0, 360, size=2) == b""
     assert imapb(value, -19.2, 19.2, size=3) == b""
-
-
-@pytest.mark.parametrize(
-    ("size", "code"), [(0, "00"), (127, "7f"), (128, "8180"), (256, "820100"), (65_536, "83010000")]
-)
-def test_lengths(size, code):
-    """Everything behind a long item would be read as something else."""
-    assert ber_length(size).hex() == code
-    assert klvdata.common.ber_decode(ber_length(size)) == size
-
-
-@pytest.mark.parametrize(("number", "code"), [(0, "00"), (127, "7f"), (128, "8100"), (16_384, "818000")])
-def test_identifiers(number, code):
-    """A track would have another's id."""
-    assert ber_oid(number).hex() == code
-
-
-def test_numbers_take_the_bytes_they_need():
-    """A frame of many targets would be twice as large."""
-    assert [whole(one).hex() for one in (0, 255, 256, 1 << 40)] == ["00", "ff", "0100", "010000000000"]
 
 
 @given(st.binary(max_size=40))
