@@ -52,29 +52,26 @@ AERIAL = ("car", "truck", "pedestrian")
 STREET = ("vehicle", "person", "bike")
 
 
-def test_one_object_gets_one_box_with_the_mean_of_both() -> None:
-    """Every car that two networks know would have two boxes, and two tracks."""
-    first = Says(AERIAL, ((0, 0, 40, 20), 0.6, "truck"))
-    second = Says(STREET, ((4, 0, 44, 20), 0.3, "vehicle"))
-    assert merged(first, second) == [((1.33, 0, 41.33, 20), 0.6, "truck")]
+HERE = (0, 0, 40, 20)
 
 
-def test_what_one_part_alone_finds_or_knows_passes_through() -> None:
-    """A street network that is blind straight down would halve what the aerial one finds there."""
-    first = Says(AERIAL, ((0, 0, 40, 20), 0.6, "car"))
-    second = Says(STREET, ((0, 50, 40, 70), 0.5, "bike"), ((100, 0, 110, 20), 0.4, "person"))
-    assert merged(first, second) == [
-        ((0, 0, 40, 20), 0.6, "car"),
-        ((0, 50, 40, 70), 0.5, "bike"),
-        ((100, 0, 110, 20), 0.4, "pedestrian"),
-    ]
-
-
-def test_a_rider_and_the_car_behind_stay_two() -> None:
-    """Boxes of two groups at one place are two objects."""
-    first = Says(AERIAL, ((0, 0, 40, 40), 0.6, "car"))
-    second = Says(STREET, ((0, 0, 40, 40), 0.5, "person"))
-    assert len(merged(first, second)) == 2
+@pytest.mark.parametrize(
+    ("first", "second", "together"),
+    [
+        ([(HERE, 0.6, "truck")], [((4, 0, 44, 20), 0.3, "vehicle")], [((1.33, 0, 41.33, 20), 0.6, "truck")]),
+        (  # what one part alone finds or knows passes through
+            [(HERE, 0.6, "car")],
+            [((0, 50, 40, 70), 0.5, "bike"), ((100, 0, 110, 20), 0.4, "person")],
+            [(HERE, 0.6, "car"), ((0, 50, 40, 70), 0.5, "bike"), ((100, 0, 110, 20), 0.4, "pedestrian")],
+        ),
+        ([(HERE, 0.6, "car")], [(HERE, 0.5, "person")], [(HERE, 0.6, "car"), (HERE, 0.5, "pedestrian")]),
+    ],
+)
+def test_one_object_gets_one_box_with_the_mean_of_both(
+    first: list[Row], second: list[Row], together: list[Row]
+) -> None:
+    """Every car that two networks know would have two tracks; a rider and the car behind it are two objects."""
+    assert merged(Says(AERIAL, *first), Says(STREET, *second)) == together
 
 
 def test_each_part_counts_from_its_own_confidence() -> None:

@@ -39,20 +39,19 @@ def test_a_cookie_is_of_the_port_that_the_browser_sees(host, name):
     assert cookie_name({"host": host}) == name
 
 
-def test_each_ground_takes_its_own_cookie_of_two():
-    """The token of the other ground would be tried, and refused."""
+@pytest.mark.parametrize(
+    ("port", "cookie", "role"),
+    [
+        (8080, f"hvt-8080={'o' * 20}; hvt-8081=other", "operator"),
+        (8081, f"hvt-8080={'o' * 20}; hvt-8081=other", None),
+        (8080, f"hvt={'v' * 20}", "viewer"),  # of a proxy
+        (8080, f'prefs={{"theme":"dark"}}; =; a b; hvt-8080={"o" * 20}', "operator"),
+    ],
+)
+def test_each_ground_takes_its_own_cookie_of_several(port, cookie, role):
+    """The token of another ground would be refused, or JSON in the cookie of another page throw operators out."""
     access = Access({"operator": "o" * 20, "viewer": "v" * 20})
-    cookie = f"hvt-8080={'o' * 20}; hvt-8081=other"
-    assert access.role({"host": "10.8.0.1:8080", "cookie": cookie}) == "operator"
-    assert access.role({"host": "10.8.0.1:8081", "cookie": cookie}) is None
-    assert access.role({"host": "10.8.0.1:8080", "cookie": f"hvt={'v' * 20}"}) == "viewer", "of a proxy"
-
-
-def test_a_cookie_of_another_program_that_is_out_of_form_hides_none_of_ours():
-    """A page of the same host that keeps JSON in a cookie would throw every operator out."""
-    cookie = f'prefs={{"theme":"dark"}}; =; a b; hvt-8080={"o" * 20}'
-    access = Access({"operator": "o" * 20, "viewer": "v" * 20})
-    assert access.role({"host": "10.8.0.1:8080", "cookie": cookie}) == "operator"
+    assert access.role({"host": f"10.8.0.1:{port}", "cookie": cookie}) == role
 
 
 @pytest.mark.parametrize(
@@ -75,41 +74,34 @@ def test_a_proxy_that_drops_the_port_is_told_which_header_is_wrong(host, origin,
     assert found.count(said) if said else found == ""
 
 
-@pytest.mark.parametrize(
-    ("host", "role"),
-    [
-        ("127.0.0.1:8080", "operator"),
-        ("127.0.0.2", "operator"),
-        ("LocalHost:8080", "operator"),
-        ("[::1]:8080", "operator"),
-        ("[::ffff:127.0.0.1]", "operator"),
-        ("127.evil.example:8080", None),
-        ("127.0.0.1.evil.example", None),
-        ("localhost.evil.example", None),
-        ("127.0.0.1:8080, evil.example", None),
-        ("[127.0.0.1", None),
-        ("localhost.", None),
-        ("127.0.0.1.", None),
-        ("[::1].evil.example", None),
-        ("evil.example[::1]:8080", None),
-        ("127.1", None),
-        ("0x7f000001", None),
-        ("operator@127.0.0.1", None),
-        ("127.0.0.1:0", None),
-        ("evil.example", None),
-        ("192.0.2.7", None),
-        ("", None),
-    ],
+LOOPBACK = ("127.0.0.1:8080", "127.0.0.2", "LocalHost:8080", "[::1]:8080", "[::ffff:127.0.0.1]")
+OTHERS = (
+    *(
+        "127.evil.example:8080",
+        "127.0.0.1.evil.example",
+        "localhost.evil.example",
+        "127.0.0.1:8080, evil.example",
+    ),
+    *(
+        "[127.0.0.1",
+        "localhost.",
+        "127.0.0.1.",
+        "[::1].evil.example",
+        "evil.example[::1]:8080",
+        "127.1",
+        "0x7f000001",
+    ),
+    *("operator@127.0.0.1", "127.0.0.1:0", "evil.example", "192.0.2.7", ""),
 )
-def test_only_an_address_of_loopback_makes_an_operator(host, role):
-    """Any website could have such a name lead here, and command the edge from its page."""
-    assert Access({}).role({"host": host}) == role
-    assert Access({}, proxy="hvt.example.org").role({"host": host} | OPERATOR) is None
 
 
-def test_a_role_counts_from_the_named_proxy_alone():
-    """A page may set any header in requests to its own origin, and would name itself operator."""
-    assert Access({}, proxy="hvt.example.org").role({"host": "hvt.example.org"} | OPERATOR) == "operator"
+@pytest.mark.parametrize("host", [*LOOPBACK, *OTHERS])
+def test_only_an_address_of_loopback_makes_an_operator(host):
+    """Any website could have such a name lead here, and command the edge; or a page name itself operator."""
+    assert Access({}).role({"host": host}) == ("operator" if host in LOOPBACK else None)
+    behind = Access({}, proxy="hvt.example.org")
+    assert behind.role({"host": host} | OPERATOR) is None
+    assert behind.role({"host": "hvt.example.org"} | OPERATOR) == "operator"
     assert Access({}).role({"host": "127.0.0.1:8080"} | OPERATOR) is None, "no proxy was named"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 import pytest
 
@@ -37,50 +37,38 @@ def hub() -> Iterator[Hub]:
     loop.close()
 
 
-def flown(hub: Hub, *, frames: int, keyframe_every: int) -> EdgePage:
+def flown(hub: Hub, *, frames: int, keyframes: Container[int] = (0,)) -> EdgePage:
     """An edge of which so many frames have come."""
     edge = EdgePage("uav-1")
     hub.begin(edge, {"edge": "uav-1"})
     hub.made(edge, Made("h264", Start("avc1.42c01f", b"start")), frame_index=0, captured_ms=0)
     for number in range(frames):
-        hub.made(
-            edge, fragment(number, keyframe=number % keyframe_every == 0), frame_index=number, captured_ms=0
-        )
+        hub.made(edge, fragment(number, keyframe=number in keyframes), frame_index=number, captured_ms=0)
     return edge
 
 
-def test_who_joins_between_keyframes_begins_at_the_last_one(hub):
+@pytest.mark.parametrize(
+    ("frames", "keyframes", "more", "shown"),
+    [
+        (26, range(0, 26, 10), 0, ["start", "init", *range(20, 26)]),
+        (900, [0], 1, ["start", "init", *range(901)]),  # on a thin link keyframes come once a minute
+        (2003, [0, 2004], 3, ["start", "init", 2004, 2005]),  # its keyframe is no longer kept
+    ],
+)
+def test_who_joins_begins_at_a_keyframe(hub, frames, keyframes, more, shown):
     """The picture would stay black until the next keyframe, or be broken."""
-    flown(hub, frames=26, keyframe_every=10)
-    viewer = Viewer()
-    hub.watch(viewer, "uav-1", "h264")
-    assert kinds(viewer)[1:] == ["start", "init", *(f"fragment {number}" for number in range(20, 26))]
-
-
-def test_who_joins_long_after_a_keyframe_begins_there_too(hub):
-    """On a thin link keyframes come once a minute: a second viewer would see black until then."""
-    edge = flown(hub, frames=900, keyframe_every=2000)
+    edge = flown(hub, frames=frames, keyframes=keyframes)
     viewer = Viewer()
     hub.join(viewer)
     hub.watch(viewer, "uav-1", "h264")
-    hub.made(edge, fragment(900), frame_index=900, captured_ms=0)
-    assert kinds(viewer)[4:] == [f"fragment {number}" for number in range(901)]
-
-
-def test_who_joins_where_the_keyframe_is_no_longer_kept_waits_for_the_next(hub):
-    """He would be shown a broken picture."""
-    edge = flown(hub, frames=2003, keyframe_every=4000)
-    viewer = Viewer()
-    hub.join(viewer)
-    hub.watch(viewer, "uav-1", "h264")
-    for number in range(2003, 2006):
-        hub.made(edge, fragment(number, keyframe=number == 2004), frame_index=number, captured_ms=0)
-    assert kinds(viewer)[4:] == ["fragment 2004", "fragment 2005"]
+    for number in range(frames, frames + more):
+        hub.made(edge, fragment(number, keyframe=number in keyframes), frame_index=number, captured_ms=0)
+    assert kinds(viewer)[2:] == [f"fragment {one}" if isinstance(one, int) else one for one in shown]
 
 
 def test_a_slow_viewer_goes_on_at_a_keyframe_and_loses_no_words(hub):
     """It would see a broken picture, or fill the memory of the ground."""
-    edge = flown(hub, frames=1, keyframe_every=10)
+    edge = flown(hub, frames=1)
     slow, quick = Viewer(), Viewer()
     for viewer in (slow, quick):
         hub.join(viewer)
@@ -101,7 +89,7 @@ def test_a_slow_viewer_goes_on_at_a_keyframe_and_loses_no_words(hub):
 
 def test_a_thumbnail_is_no_keyframe(hub):
     """Who is slow would be shown a broken picture each time the wall is."""
-    edge = flown(hub, frames=1, keyframe_every=1000)
+    edge = flown(hub, frames=1)
     slow = Viewer()
     hub.join(slow)
     hub.show_wall(slow, shown=True)
@@ -115,7 +103,7 @@ def test_a_thumbnail_is_no_keyframe(hub):
 
 def test_nothing_is_made_for_nobody(hub):
     """The ground would spend a processor on pictures that nobody looks at."""
-    edge = flown(hub, frames=3, keyframe_every=10)
+    edge = flown(hub, frames=3)
     viewer, other = Viewer(), Viewer()
     for one in (viewer, other):
         hub.join(one)
@@ -135,32 +123,29 @@ def test_nothing_is_made_for_nobody(hub):
     assert not edge.wanted
 
 
-def test_a_still_that_comes_again_takes_its_own_place():
-    """One that shows several objects comes several times: in the end no picture at all would be there."""
-    pictures = StillPictures()
+def test_the_pictures_of_stills_stay_for_as_long_as_they_are_asked_for():
+    """One that shows several objects comes several times: in the end no picture at all would be there.
+
+    A browser asks for a picture when it has read the list: it got 404 for the oldest eight of them.
+    """
+    pictures, listed = StillPictures(), StillPictures()
     for number in range(4000):
         pictures.add(str(number // 4), "still", bytes(30_000), "image/jpeg")
     there = [number for number in range(1000) if pictures.get(str(number), "still") is not None]
-    assert there[-1] == 999
-    assert len(there) > 100
-
-
-def test_the_pictures_of_a_list_are_there_while_newer_stills_come():
-    """A browser asks for a picture when it has read the list: it got 404 for the oldest eight of them."""
-    pictures = StillPictures()
+    assert (there[-1], len(there) > 100) == (999, True)
     for number in range(120):
         for which in ("still", "base"):
-            pictures.add(str(number), which, bytes(3_000), "image/jpeg")
-    for number in range(60):
-        assert pictures.get(str(number), "still") is not None, "it was in the list sixty stills ago"
+            listed.add(str(number), which, bytes(3_000), "image/jpeg")
+    assert all(listed.get(str(number), "still") for number in range(60)), "in the list sixty stills ago"
 
 
-def test_who_takes_nothing_at_all_is_given_up():
-    """A browser that hangs would hold what is not dropped for ever."""
+@pytest.mark.parametrize(("times", "words"), [(3000, "words"), (1000, "x" * 60_000)])
+def test_who_takes_nothing_at_all_is_given_up(times, words):
+    """A browser that hangs would hold what is not dropped for ever: sixty of them would take gigabytes."""
     viewer = Viewer()
-    for _ in range(3000):
-        viewer.put("words")
-    assert viewer.hopeless
+    for _ in range(times):
+        viewer.put(words)
+    assert (viewer.hopeless, viewer.empty) == (True, True)
     with pytest.raises(ConnectionError):
         asyncio.run(viewer.take())
 
@@ -178,15 +163,6 @@ def test_that_a_viewer_has_gone_is_heard_between_two_messages():
         assert heard == ["lost"]
 
     asyncio.run(sent())
-
-
-def test_few_long_words_are_too_much_too():
-    """Sixty viewers that hang would take gigabytes, two thousand messages each."""
-    viewer = Viewer()
-    for _ in range(1000):
-        viewer.put("x" * 60_000)
-    assert viewer.hopeless
-    assert viewer.empty
 
 
 def ceased(hub: Hub, edge: EdgePage, frame: int) -> None:
@@ -211,7 +187,7 @@ def made() -> None:
 
 def test_who_comes_during_an_outage_sees_the_last_picture(hub):
     """The page was black for the very edge that was lost, or showed it as when somebody had last looked."""
-    edge = flown(hub, frames=3, keyframe_every=10)
+    edge = flown(hub, frames=3)
     hub.overlay(edge, '{"type": "overlay"}')
     assert not [one.name for one in threading.enumerate() if one.name == "hvt-web-last"], "nobody looks"
     ceased(hub, edge, 90)
@@ -232,7 +208,7 @@ def test_who_comes_during_an_outage_sees_the_last_picture(hub):
 
 def test_who_looks_again_at_an_edge_that_goes_on_sees_nothing_old(hub):
     """The picture of an hour ago would stand as the live one until the next keyframe."""
-    edge = flown(hub, frames=3, keyframe_every=10)
+    edge = flown(hub, frames=3)
     viewer = Viewer()
     hub.join(viewer)
     hub.watch(viewer, "uav-1", "h264")
@@ -250,9 +226,9 @@ def test_who_looks_again_at_an_edge_that_goes_on_sees_nothing_old(hub):
 
 def test_stills_of_the_flight_before_stay_where_an_edge_starts_again(hub):
     """The page lists them on, and those that it had not loaded yet would be broken pictures."""
-    before = flown(hub, frames=3, keyframe_every=10)
+    before = flown(hub, frames=3)
     hub.still(before, "{}", [("000001-0", "still", b"picture", "image/jpeg")])
-    flown(hub, frames=3, keyframe_every=10)
+    flown(hub, frames=3)
     now = hub.edges["uav-1"]
     assert (list(now.stills), now.pictures.get("000001-0", "still")) == (["{}"], (b"picture", "image/jpeg"))
 

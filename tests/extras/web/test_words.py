@@ -21,6 +21,7 @@ from programs.node import needs_node, ran
 
 ROOT = Path(__file__).parents[3]
 STATIC = Path(hvt_web.__file__).parent / "static"
+WORDS = json.dumps((STATIC / "words.js").as_uri())
 LIVE = {
     "connected": True, "refused": False, "goneMs": 0, "link": "up", "silentMs": 100, "chosen": True, "shown": True,
     "follows": True, "plays": True, "ageMs": 300, "sinceMs": 80, "periodsMs": [100], "lastMs": 300, "lockstep": False,
@@ -29,13 +30,11 @@ LIVE = {
 
 def said(calls: list[tuple[str, list]]) -> list:
     """What functions of words.js return."""
-    return ran(
-        f"""
-      import * as words from {json.dumps((STATIC / "words.js").as_uri())};
+    return ran(f"""
+      import * as words from {WORDS};
       const calls = {json.dumps(calls)};
       console.log(JSON.stringify(calls.map(([name, given]) => words[name](...given))));
-    """
-    )
+    """)
 
 
 @needs_node
@@ -87,15 +86,13 @@ SENTENCES: dict[str, list[tuple[list, Any]]] = json.loads(
 @needs_node
 def test_every_sentence_of_the_page_is_read():
     """A word of the code, a hole or a number that nobody knows would stand before who flies."""
-    found = ran(
-        f"""
-      import * as words from {json.dumps((STATIC / "words.js").as_uri())};
+    found = ran(f"""
+      import * as words from {WORDS};
       const given = {json.dumps({name: [one for one, _ in cases] for name, cases in SENTENCES.items()})};
       const say = (one, cases) => (typeof one === "function" ? cases.map((args) => one(...args)) : [one]);
       const said = Object.entries(words).map(([name, one]) => [name, say(one, given[name] ?? [])]);
       console.log(JSON.stringify(Object.fromEntries(said)));
-    """
-    )
+    """)
     assert found == {name: [said for _, said in cases] for name, cases in SENTENCES.items()}
     for said in texts(found):
         assert not re.search(r"undefined|null|NaN|\[object|\$\{|_|  ", said), said
@@ -108,15 +105,13 @@ def test_boxes_go_on_with_their_objects_until_the_next_list_comes():
     before = {"frame": 0, "captured": 1000, "tracks": [smaller]}
     parked = {"id": 2, "box": [50, 50, 60, 60]}
     found = {"frame": 5, "captured": 1300, "tracks": [{"id": 1, "box": [60, 0, 80, 10]}, parked]}
-    boxes = ran(
-        f"""
+    boxes = ran(f"""
       import {{ carried }} from {json.dumps((STATIC / "boxes.js").as_uri())};
       const [found, before] = {json.dumps([found, before])};
       const at = (list, captured) => carried(found, list, captured).map(({{ box }}) => box);
       const times = [1500, 2100].map((captured) => at(before, captured));
       console.log(JSON.stringify([...times, at(before, 1300), at(null, 1500), at(found, 1500)]));
-    """
-    )
+    """)
     seen = [[60, 0, 80, 10], parked["box"]]
     furthest = [[180, 0, 200, 10], parked["box"]]
     assert boxes == [[[100, 0, 120, 10], parked["box"]], furthest, seen, seen, seen], "it never goes back"
@@ -136,15 +131,13 @@ def test_a_box_goes_out_of_the_picture_with_its_object():
             (5, [[0, 0, 10, 9], [62, 0, 64, 9], [45, 0, 55, 9]]),
         )
     ]
-    drawn = ran(
-        f"""
+    drawn = ran(f"""
       import {{ Boxes }} from {json.dumps((STATIC / "boxes.js").as_uri())};
       const overlays = new Map({json.dumps([[one["frame"], one] for one in lists])});
       const about = {{ overlays, frame: 9, captured: 360, size: [64, 36] }};
       const boxes = Object.assign(Object.create(Boxes.prototype), about);
       console.log(JSON.stringify(boxes.current().tracks));
-    """
-    )
+    """)
     assert drawn == [{"id": 2, "box": [49, 0, 59, 9]}]
 
 
@@ -199,8 +192,7 @@ ELEMENTS = """
 @needs_node
 def test_an_edge_that_sends_no_picture_has_no_green_light():
     """A camera that died behind a link that works would look well on the wall."""
-    found = ran(
-        f"""
+    found = ran(f"""
       {ELEMENTS}
       const {{ Wall }} = await import({json.dumps((STATIC / "wall.js").as_uri())});
       URL.createObjectURL = () => "";
@@ -216,8 +208,7 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
       wall.refresh(112000, new Set(["uav-2"])); // a ground that was restarted tells of that one alone
       const {{ light, bar }} = wall.card("uav-1");
       console.log(JSON.stringify([...seen, [light.dataset.state, bar.ariaValueText]]));
-    """
-    )
+    """)
     silent = ["silent", "no picture 12 s"]
     assert found == [
         ["up", "up 3 s"],
@@ -231,8 +222,7 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
 @needs_node
 def test_edges_that_come_later_do_not_push_the_chosen_one_off_the_screen():
     """On a phone, which shows two, the one that the address names was nowhere; and uav-10 stood before uav-2."""
-    found = ran(
-        f"""
+    found = ran(f"""
       {ELEMENTS}
       const {{ Wall }} = await import({json.dumps((STATIC / "wall.js").as_uri())});
       const cards = [];
@@ -250,16 +240,14 @@ def test_edges_that_come_later_do_not_push_the_chosen_one_off_the_screen():
       wall.mark("uav-2");
       for (const name of ["uav-10", "uav-1", "uav-0"]) wall.card(name);
       console.log(JSON.stringify([cards.map((one) => one.dataset.edge), root.scrollLeft]));
-    """
-    )
+    """)
     assert found == [["uav-0", "uav-1", "uav-2", "uav-10"], 200]
 
 
 @needs_node
 def test_the_plot_draws_no_line_over_what_is_not_known():
     """A minute without a link would be a straight line of bits that nobody sent, and the past would stand as now."""
-    found = ran(
-        f"""
+    found = ran(f"""
       const lines = [];
       const drawn = (kind) => (x) => lines.push([kind, Math.round(x)]);
       const known = {{ measureText: () => ({{ width: 1 }}), moveTo: drawn("move"), lineTo: drawn("line") }};
@@ -277,16 +265,14 @@ def test_the_plot_draws_no_line_over_what_is_not_known():
       plot.now = 100000;
       plot.draw();
       console.log(JSON.stringify(lines.slice(0, 5)));
-    """
-    )
+    """)
     assert found == [["move", 140], ["line", 141], ["line", 142], ["move", 200], ["line", 201]]
 
 
 @needs_node
 def test_names_give_way_and_what_was_not_seen_in_this_picture_is_faint():
     """On a crowded car park nobody could read a name, or see a car under one; old boxes would pass for new ones."""
-    found = ran(
-        f"""
+    found = ran(f"""
       let drawn = {{ boxes: [], names: [] }};
       const known = {{ measureText: (text) => ({{ width: 6 * text.length }}),
         strokeRect(...box) {{ drawn.boxes.push([...box, this.globalAlpha, this.strokeStyle]); }},
@@ -312,8 +298,7 @@ def test_names_give_way_and_what_was_not_seen_in_this_picture_is_faint():
       boxes.toggle(false);
       out.none = seen(1000, crowd);
       console.log(JSON.stringify(out));
-    """
-    )
+    """)
     crowd, old = found["crowd"], found["old"]
     assert len(crowd["boxes"]) == 60
     assert 10 < len(crowd["names"]) < 60
