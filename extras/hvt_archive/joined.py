@@ -6,22 +6,18 @@
 from __future__ import annotations
 
 import argparse
-import logging
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from rerun.chunk import Chunk
 
+from hvt_archive.reading.recorded import readable_part
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
-from hvt_ground.sinks.rerun.readable import readable, what_is_read
 from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
-
-_log = logging.getLogger(__name__)
 
 _FLUSH_S = 10.0
 
@@ -54,20 +50,10 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
 
 def _read(path: Path) -> tuple[str, list[Chunk]]:
     # The edge's id, and everything but the file's own entities; of a damaged file its readable part.
-    try:
-        with path.open("rb"), tempfile.TemporaryDirectory() as folder:
-            (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone
-            found = readable(name, Path(folder) / "readable.rrd")
-            if found is None:
-                raise ValueError("nothing in it can be read")  # noqa: TRY301 - in one sentence with the others
-            reader = open_rrd(found)
-            chunks = [one for one in reader.stream() if not one.entity_path.startswith("/__")]
-            edge = id_of(reader).edge
-    except (OSError, RuntimeError, ValueError) as error:
-        raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
-    if found != name:
-        _log.warning("%s %s is joined", path, what_is_read(path))
-    return edge, chunks
+    with readable_part(path, done="joined") as (found, _):
+        reader = open_rrd(found)
+        chunks = [one for one in reader.stream() if not one.entity_path.startswith("/__")]
+        return id_of(reader).edge, chunks
 
 
 def main(argv: Sequence[str] | None = None) -> int:

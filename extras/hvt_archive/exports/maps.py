@@ -42,23 +42,17 @@ class Fix:
     latitude_deg: float
     height_m: float | None = None
     """Above the ground."""
+    ellipse: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of a track: half its axes in metres, and the longer one's direction."""
 
     @property
     def position(self) -> list[float]:
         return [round(self.longitude_deg, _DIGITS), round(self.latitude_deg, _DIGITS)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Spot(Fix):
-    """A track at one moment."""
-
-    ellipse: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Half its axes in metres, and the longer one's direction."""
-
-
 @dataclass(slots=True)
 class _Track:
-    spots: list[_Spot] = field(default_factory=list)
+    spots: list[Fix] = field(default_factory=list)
     classes: Counter[str] = field(default_factory=Counter)
     confidence: float = 0.0
     refined: bool = False
@@ -72,7 +66,7 @@ class _Track:
         return self.classes.most_common(1)[0][0]
 
     @property
-    def surest(self) -> _Spot:
+    def surest(self) -> Fix:
         return min(self.spots, key=lambda one: one.ellipse[0])
 
     @property
@@ -177,7 +171,7 @@ def _tracks(recorded: Recorded) -> dict[int, _Track]:
             track.first_ns, track.last_ns = min(track.first_ns, at_ns), max(track.last_ns, at_ns)
             if not track.spots or abs(at_ns - track.spots[-1].capture_ns) >= _EVERY_NS:
                 major, minor, azimuth = places.ellipses[row].tolist()
-                track.spots.append(_Spot(at_ns, longitude, latitude, ellipse=(major, minor, azimuth)))
+                track.spots.append(Fix(at_ns, longitude, latitude, ellipse=(major, minor, azimuth)))
     return dict(sorted(tracks.items()))
 
 
@@ -204,7 +198,7 @@ def _camera_feature(recorded: Recorded) -> dict[str, Any]:
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def _outline(spot: _Spot) -> list[tuple[float, float]]:
+def _outline(spot: Fix) -> list[tuple[float, float]]:
     """Latitude and longitude around the ellipse, the first again at the end."""
     major, minor, azimuth = spot.ellipse
     turned = math.radians(azimuth)

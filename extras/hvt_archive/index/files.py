@@ -9,8 +9,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +35,14 @@ def claimed(path: Path) -> Iterator[bool]:
 
     Not where nobody can tell, as on a file system without locks.
     """
-    file = -1
-    try:
-        try:
+    with ExitStack() as stack:
+        ours = False
+        with suppress(OSError):
             file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            stack.callback(os.close, file)
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            yield False
-        else:
-            yield True
-    finally:
-        if file >= 0:
-            os.close(file)
+            ours = True
+        yield ours
 
 
 def is_claimed(path: Path) -> bool:
@@ -58,21 +53,17 @@ def is_claimed(path: Path) -> bool:
 
 def described(path: Path) -> RecordingRow | None:
     """Read a file's description of itself; None if it is no recording of ours."""
-    with suppress(OSError), tempfile.TemporaryDirectory() as folder:
-        found = readable(path, Path(folder) / path.name)
-        row, state = _described(found) if found else None, path.stat()
-        return row and replace(row, written_ns=state.st_mtime_ns, size_bytes=state.st_size)
-    return None
-
-
-def _described(path: Path) -> RecordingRow | None:
     content = _Content()
     try:
-        reader = open_rrd(path)
-        whose = id_of(reader)
-        for chunk in reader.stream():
-            content.add(chunk)
-        state = path.stat()
+        with tempfile.TemporaryDirectory() as folder:
+            found = readable(path, Path(folder) / path.name)
+            if found is None:
+                return None
+            reader = open_rrd(found)
+            whose = id_of(reader)
+            for chunk in reader.stream():
+                content.add(chunk)
+            state = path.stat()
     except (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError):
         return None
     if not re.fullmatch(r"[0-9a-f]+", whose.session):

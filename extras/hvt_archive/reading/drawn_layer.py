@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 from hvt_archive.reading.spool import SpooledRows, Timed
@@ -41,10 +41,10 @@ class DrawnLayer:
         """By component, the row that was requested last, and its place."""
         self._names: dict[int, str] = {}
 
-    def add(self, component: str, rows: Sequence[Timed]) -> None:
+    def add(self, component: str, rows: SpooledRows) -> None:
         """Take all rows of a component; the names of classes hold for all times."""
         name = component.rpartition(":")[2]
-        if isinstance(rows, SpooledRows):
+        if name in TRACK_COMPONENTS:
             rows.sort()
             self._rows[name] = rows
             return

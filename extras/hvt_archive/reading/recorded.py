@@ -9,12 +9,11 @@ import logging
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rerun.chunk import Chunk
@@ -53,12 +52,13 @@ _LEVELS: Mapping[str, str] = {"INFO": "info", "WARN": "warning", "ERROR": "error
 _POSE, _INFO, _MESSAGE = "pose", "info", "message"
 _ONE_COMPONENT = {MAP_CAMERA: _POSE, SESSION: _INFO, STILL_MESSAGES: _MESSAGE}
 """The components that are read of these entities."""
-_SAMPLE, _PICTURE, _CAPTION = "VideoStream:sample", "EncodedImage:blob", "Boxes2D:labels"
+_SAMPLE, _PICTURE, _CAPTION, _CONTEXT = "VideoStream:sample", "EncodedImage:blob", "Boxes2D:labels", "context"
 
 _ODD = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 """Exceptions from a file that is no recording, or has other values under our names."""
 
-_Rows = dict[tuple[str, str], list[Timed] | SpooledRows]
+_Rows = dict[tuple[str, str], SpooledRows]
+"""By entity and component."""
 """By entity and component; components that grow with the flight are on disk."""
 
 
@@ -135,31 +135,46 @@ def read_recordings(paths: Sequence[Path], *, locator: Locator = NOWHERE) -> Rec
     """
     spool = Spool()
     named = {path.resolve(): path for path in paths}.values()  # one that is named twice is read once
-    files = sorted((_opened(path, spool, at) for at, path in enumerate(named)), key=lambda one: one.first)
-    names = {one.whose for one in files}
+    files = sorted((_file(path, spool, at) for at, path in enumerate(named)), key=lambda one: one.first)
     rows: _Rows = {}
     for file in files:
         file.go_on_from(rows)
         for where, found in file.rows.items():
-            before = rows.setdefault(where, found)
-            if isinstance(before, list):
-                before.extend(found if before is not found else ())
-            elif before is not found and isinstance(found, SpooledRows):
+            if (before := rows.setdefault(where, found)) is not found:
                 before.extend(found)
+    all_paths, names = ", ".join(map(str, paths)), {one.whose for one in files}
     if len(names) > 1:
-        raise UserError(
-            f"{', '.join(map(str, paths))} are of {len(names)} sessions: give the files of one session"
-        )
+        raise UserError(f"{all_paths} are of {len(names)} sessions: give the files of one session")
     if not all(one.ours for one in files):
-        raise UserError(
-            f"{', '.join(map(str, paths))}: no recording of one edge: give the files that hvt-ground wrote"
-        )
+        raise UserError(f"{all_paths}: no recording of one edge: give the files that hvt-ground wrote")
     try:
         return _recorded(names.pop(), rows, locator, spool)
     except _ODD as error:
         raise UserError(
-            f"{', '.join(map(str, paths))}: not as hvt-ground writes a recording ({type(error).__name__}: {error})"
+            f"{all_paths}: not as hvt-ground writes a recording ({type(error).__name__}: {error})"
         ) from None
+
+
+@contextmanager
+def readable_part(path: Path, *, done: str) -> Iterator[tuple[Path, bool]]:
+    """The readable part of a recording, as a file, and whether it is all; else the log has that it is ``done``.
+
+    Raises:
+        UserError: it cannot be read, or is no recording.
+    """
+    with telling(f"recording {path} cannot be read: "):
+        path.open("rb").close()
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone
+            found = readable(name, Path(folder) / "readable.rrd")
+            if found is None:
+                raise ValueError("nothing in it can be read")
+            yield found, found == name
+        except _ODD as error:
+            raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
+    if found != name:
+        _log.warning("%s %s is %s", path, what_is_read(path), done)
 
 
 def _recorded(whose: RecordingId, rows: _Rows, locator: Locator, spool: Spool) -> Recorded:
@@ -168,12 +183,11 @@ def _recorded(whose: RecordingId, rows: _Rows, locator: Locator, spool: Spool) -
         if entity in layers:
             layers[entity].add(component, found)
     samples = rows.get((VIDEO, _SAMPLE), SpooledRows(spool, blobs=True))
-    assert isinstance(samples, SpooledRows)
     samples.sort(unique=True)
     return _Read(
         edge=whose.edge,
         session=whose.session,
-        info=_info(rows.get((SESSION, _INFO), [])),
+        info=_info(rows.get((SESSION, _INFO), ())),
         video=Mapped(samples, _sample),
         stills=_stills(rows),
         notices=_notices(rows),
@@ -209,21 +223,21 @@ class _File:
         """
         if not before:
             return
-        for (entity, component), found in self.rows.items():
-            if component == _PICTURE and isinstance(found, SpooledRows):
-                known = {hash(value) for _, _, value in before.get((entity, component), [])}
+        for where, found in self.rows.items():
+            if where[1] == _PICTURE:
+                known = {hash(value) for _, _, value in before.get(where, ())}
                 found.keep(partial(self._is_new, found, known))
         for layer in _LAYERS:
             ids = self.rows.get((layer, "track_id"))
-            if not (isinstance(ids, SpooledRows) and any(frame <= self.first for frame in ids.frames)):
+            if ids is None or all(frame > self.first for frame in ids.frames):
                 for where, former in before.items():
-                    if where[0] == layer and former and isinstance(former, SpooledRows):
+                    if where[0] == layer and former and not where[1].endswith(_CONTEXT):
                         self.rows[where] = former.begun(*self._begins, [], then=self.rows.get(where))
 
     def drop_after_holes(self) -> int:
         """Take out samples after lost ones, up to the next keyframe; how many."""
         samples = self.rows.get((VIDEO, _SAMPLE))
-        if not isinstance(samples, SpooledRows):
+        if samples is None:
             return 0
         decoder, stays = BaseDecoder(), list[bool]()
         for place in range(len(samples)):
@@ -238,21 +252,10 @@ class _File:
         return found.frames[place] > self.first or hash(found.value(place)) not in known
 
 
-def _opened(path: Path, spool: Spool, number: int) -> _File:
-    with telling(f"recording {path} cannot be read: "):
-        path.open("rb").close()
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone
-            found = readable(name, Path(folder) / "readable.rrd")
-            if found is None:
-                raise ValueError("nothing in it can be read")
-            file = _read(found, spool, number)
-            lost = file.drop_after_holes() if found != name and has_holes(path, found) else 0
-        except _ODD as error:
-            raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
-    if found != name:
-        _log.warning("%s %s is exported", path, what_is_read(path))
+def _file(path: Path, spool: Spool, number: int) -> _File:
+    with readable_part(path, done="exported") as (found, whole):
+        file = _read(found, spool, number)
+        lost = file.drop_after_holes() if not whole and has_holes(path, found) else 0
     if lost:
         _log.warning("%s: %d pictures after a hole are left out: they need one that is lost", path, lost)
     return file
@@ -264,27 +267,17 @@ def _read(path: Path, spool: Spool, number: int) -> _File:
     ours = False
     for chunk in reader.stream():
         ours |= chunk.entity_path.startswith("/base/")
-        for component, of_chunk in _rows(chunk):
-            found = [of_file(row, component, number=number) for row in of_chunk]
-            entity = chunk.entity_path
-            blobs = component in (_SAMPLE, _PICTURE)
-            if blobs or (entity in _LAYERS and not component.endswith("context")):
-                spooled = rows.setdefault((entity, component), SpooledRows(spool, blobs=blobs))
-                assert isinstance(spooled, SpooledRows)
-                for row in found:
-                    spooled.add(*row)
-            else:
-                rows.setdefault((entity, component), []).extend(found)  # type: ignore[arg-type]
+        for component, found in _rows(chunk):
+            where = chunk.entity_path, component
+            spooled = rows.setdefault(where, SpooledRows(spool, blobs=component in (_SAMPLE, _PICTURE)))
+            for row in found:
+                spooled.add(*of_file(row, component, number=number))
     for (_, component), everything in rows.items():
-        if isinstance(everything, SpooledRows):
-            everything.sort(unique=component == _SAMPLE)
-        else:
-            everything.sort(key=lambda row: row[0])
+        everything.sort(unique=component == _SAMPLE)
     return _File(id_of(reader), rows, ours=ours)
 
 
 def _rows(chunk: Chunk) -> Iterator[tuple[str, list[Timed]]]:
-    entity = chunk.entity_path
     batch = chunk.to_record_batch()
     columns = dict(zip(batch.schema.names, batch.columns, strict=True))
     static = [0] * chunk.num_rows
@@ -292,29 +285,29 @@ def _rows(chunk: Chunk) -> Iterator[tuple[str, list[Timed]]]:
     captures = columns["capture_time"].cast("int64").to_pylist() if "capture_time" in columns else static
     for one, column in zip(batch.schema, batch.columns, strict=True):
         component = (one.metadata or {}).get(b"rerun:component", b"").decode()
-        if not _is_used(entity, component):
+        if not _is_used(chunk.entity_path, component):
             continue
-        blobs = component in (_SAMPLE, _PICTURE)
-        values = (_bytes(value) for value in column) if blobs else column.to_pylist()
+        if component in (_SAMPLE, _PICTURE):  # of a list of bytes they are an eighth of Python's own
+            values = [
+                bytes(memoryview(one.values[0].values.to_numpy()))
+                if one.is_valid and len(one.values)
+                else None
+                for one in column
+            ]
+        else:
+            values = column.to_pylist()
         found = zip(frames, captures, values, strict=True)
         yield component, [row for row in found if row[2] is not None]
 
 
 def _is_used(entity: str, component: str) -> bool:
     if entity in _LAYERS:
-        return component.rpartition(":")[2] in TRACK_COMPONENTS | {"context"}
+        return component.rpartition(":")[2] in TRACK_COMPONENTS | {_CONTEXT}
     if entity in _ONE_COMPONENT:
         return component == _ONE_COMPONENT[entity]
     if entity.startswith((STILLS, PATCHES)):
         return component in (_PICTURE, _CAPTION)
     return component in (_SAMPLE, "TextLog:text", "TextLog:level")
-
-
-def _bytes(value: Any) -> bytes | None:
-    # The bytes of a list with one list of bytes, eight times as large as Python's own; None if it is empty.
-    if not value.is_valid or not len(value.values):
-        return None
-    return bytes(memoryview(value.values[0].values.to_numpy()))
 
 
 def _sample(row: Timed) -> VideoSample:
@@ -338,22 +331,18 @@ class _StillPlace:
 
 
 def _stills(rows: _Rows) -> Sequence[RecordedStill]:
-    headers = _Headers(rows.get((STILL_MESSAGES, _MESSAGE), []))
+    headers = _Headers(rows.get((STILL_MESSAGES, _MESSAGE), ()))
     found, there = [], set[tuple[int, int]]()
-    of_pictures = [
-        (entity, pictures)
-        for (entity, component), pictures in rows.items()
-        if component == _PICTURE and isinstance(pictures, SpooledRows)
-    ]
-    of_slots = {path.removesuffix("/still"): one for path, one in of_pictures if path.endswith("/still")}
-    for slot, pictures in of_slots.items():
-        captions = {frame: value[0] for frame, _, value in rows.get((slot, _CAPTION), []) if value}
-        base = rows.get((f"{slot}/base", _PICTURE))
-        crops = (
-            {frame: (base, at) for at, frame in enumerate(base.frames)}
-            if isinstance(base, SpooledRows)
-            else {}
-        )
+    of_pictures = {
+        entity: pictures for (entity, component), pictures in rows.items() if component == _PICTURE
+    }
+    for entity, pictures in of_pictures.items():
+        slot, _, which = entity.rpartition("/")
+        if which != "still":
+            continue
+        captions = {frame: value[0] for frame, _, value in rows.get((slot, _CAPTION), ()) if value}
+        base = of_pictures.get(f"{slot}/base")
+        crops = {} if base is None else {frame: (base, at) for at, frame in enumerate(base.frames)}
         # A power cut may leave the append log behind the chunks that say the same: each picture counts once.
         places = {(frame, hash(jpeg)): place for place, (frame, _, jpeg) in enumerate(pictures)}
         # Off the screen several may come at one frame, and nothing says which base crop is whose.
@@ -363,7 +352,7 @@ def _stills(rows: _Rows) -> Sequence[RecordedStill]:
             caption, header = str(captions.get(frame, "")), headers.of(pictures.value(place), frame=frame)
             found.append(_StillPlace(frame, (pictures, place), crop, caption, header))
         there |= places.keys()
-    for pictures in (one for entity, one in of_pictures if entity.startswith(PATCHES)):
+    for pictures in (one for entity, one in of_pictures.items() if entity.startswith(PATCHES)):
         for place, (frame, _, jpeg) in enumerate(pictures):
             header = headers.of(jpeg, frame=frame)
             if header is not None and (frame, hash(jpeg)) not in there:
@@ -396,13 +385,13 @@ def _info(rows: Iterable[Timed]) -> Info | None:
 def _poses(rows: _Rows) -> list[PoseUpdate]:
     found = [
         pose_of(numbers, frame_index=frame, capture_ns=capture_ns)
-        for frame, capture_ns, numbers in rows.get((MAP_CAMERA, _POSE), [])
+        for frame, capture_ns, numbers in rows.get((MAP_CAMERA, _POSE), ())
     ]
     return sorted(found, key=lambda one: (one.frame_index, one.capture_ns))
 
 
 def _notices(rows: _Rows) -> list[Notice]:
-    texts, levels = rows.get((EVENTS, "TextLog:text"), []), rows.get((EVENTS, "TextLog:level"), [])
+    texts, levels = rows.get((EVENTS, "TextLog:text"), ()), rows.get((EVENTS, "TextLog:level"), ())
     found = [
         Notice(frame, capture_ns, _LEVELS.get(level[0], "info"), text[0])  # type: ignore[arg-type]
         for (frame, capture_ns, text), (_, _, level) in zip(texts, levels, strict=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 import weakref
@@ -12,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
 
+import msgpack
 import numpy as np
 
 from hvt_common.errors import UserError
@@ -70,7 +70,7 @@ def _no_space(error: OSError) -> UserError:
 
 
 class SpooledRows(Sequence[Timed]):
-    """Rows of one component, in order of frames once they were sorted; values are bytes, or of JSON."""
+    """Rows of one component, in order of frames once they were sorted; values are bytes, or packed."""
 
     def __init__(self, spool: Spool, *, blobs: bool) -> None:
         self._spool, self._blobs = spool, blobs
@@ -78,7 +78,7 @@ class SpooledRows(Sequence[Timed]):
         """Frames, capture times, places and sizes."""
 
     def add(self, frame: int, capture_ns: int, value: Any) -> None:
-        data = value if self._blobs else json.dumps(value, separators=(",", ":")).encode()
+        data = value if self._blobs else msgpack.packb(value)
         for column, number in zip(
             self._columns, (frame, capture_ns, self._spool.put(data), len(data)), strict=True
         ):
@@ -88,11 +88,11 @@ class SpooledRows(Sequence[Timed]):
         for column, more in zip(self._columns, rows._columns, strict=True):
             column.extend(more)
 
-    def begun(self, frame: int, capture_ns: int, value: Any, *, then: Sequence[Timed] | None) -> SpooledRows:
+    def begun(self, frame: int, capture_ns: int, value: Any, *, then: SpooledRows | None) -> SpooledRows:
         """Others of the same component that begin with this row."""
         rows = SpooledRows(self._spool, blobs=self._blobs)
         rows.add(frame, capture_ns, value)
-        if isinstance(then, SpooledRows):
+        if then is not None:
             rows.extend(then)
         return rows
 
@@ -123,7 +123,7 @@ class SpooledRows(Sequence[Timed]):
 
     def value(self, place: int) -> Any:
         data = self._spool.get(self._columns[2][place], self._columns[3][place])
-        return data if self._blobs else json.loads(data)
+        return data if self._blobs else msgpack.unpackb(data)
 
     def __len__(self) -> int:
         return len(self._columns[0])

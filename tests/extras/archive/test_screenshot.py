@@ -83,11 +83,12 @@ def test_each_edge_keeps_what_is_its_own(tmp_path):
 
 def test_what_cannot_be_joined_is_said(tmp_path):
     """One flight would hide the other, or a traceback be all there is."""
-    one = recorded(tmp_path / "a.rrd", "a")
-    with pytest.raises(UserError, match="same edge"):
-        join_recordings([one, one], tmp_path / "all.rrd", base_size=(64, 48), fps=15)
-    (tmp_path / "text.rrd").write_text("no recording")
-    with pytest.raises(UserError, match=r"--out .*gone.* is in a folder that does not exist"):
-        join_recordings([one], tmp_path / "gone" / "all.rrd", base_size=(64, 48), fps=15)
-    with pytest.raises(UserError, match=r"text\.rrd"):
-        join_recordings([one, tmp_path / "text.rrd"], tmp_path / "all.rrd", base_size=(64, 48), fps=15)
+    one, text = recorded(tmp_path / "a.rrd", "a"), tmp_path / "text.rrd"
+    text.write_text("no recording")
+    for paths, out, said in (
+        ([one, one], "all.rrd", "same edge"),
+        ([one], "gone/all.rrd", r"--out .*gone.* is in a folder that does not exist"),
+        ([one, text], "all.rrd", r"text\.rrd"),
+    ):
+        with pytest.raises(UserError, match=said):
+            join_recordings(paths, tmp_path / out, base_size=(64, 48), fps=15)

@@ -69,6 +69,7 @@ def test_the_table_has_them_in_the_order_of_their_time(folder, capsys):
         (("--class", "zebra"), []),
         (("--edge", "uav-2"), ["c.rrd"]),
         (("--since", "10min"), ["c.rrd"]),
+        (("--since", "3660days"), ["b.rrd", "a.rrd", "c.rrd"]),
         (("--since", "2020-06-02"), ["a.rrd", "c.rrd"]),
         (("--since", "2020-06-01T12:30", "--until", "2020-06-01T12:40+00:00"), ["b.rrd"]),
         (("--until", "2020-06-02T13:30+02:00"), ["b.rrd"]),

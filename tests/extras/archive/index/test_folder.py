@@ -8,8 +8,9 @@ import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
@@ -57,15 +58,26 @@ def settings(folder: Path) -> RecorderSettings:
     return rrd.settings(folder / f"{STEM}.rrd")
 
 
-def fly(folder: Path, events: list[Event], retention: Retention = ALL) -> Failures:
-    """Record them with an index, to the end."""
+@contextmanager
+def flying(folder: Path) -> Iterator[tuple[SessionFiles, Failures]]:
+    """A session that is recorded with an index; whoever flies it closes it."""
     failures = Failures(time.time_ns)
-    with RecordingsFolder(folder, retention, failures=failures) as index:
+    with RecordingsFolder(folder, ALL, failures=failures) as index:
         index.begin()
-        sink = SessionFiles(settings(folder), split=SPLIT, tell=index.recorded)
-        for event in events:
-            sink.log(event)
+        yield SessionFiles(settings(folder), split=SPLIT, tell=index.recorded), failures
+
+
+def log(sink: SessionFiles, events: list[Event], *, close: bool = True) -> None:
+    for event in events:
+        sink.log(event)
+    if close:
         sink.close()
+
+
+def fly(folder: Path, events: list[Event]) -> Failures:
+    """Record them with an index, to the end."""
+    with flying(folder) as (sink, failures):
+        log(sink, events)
     return failures
 
 
@@ -80,7 +92,7 @@ def flown(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path
 @pytest.fixture
 def copied(flown: Path, tmp_path: Path) -> Path:
     """Such a folder, for one test."""
-    return copytree(flown, tmp_path, dirs_exist_ok=True)
+    return copytree(flown, tmp_path / "flights")
 
 
 def look(
@@ -161,21 +173,17 @@ def test_an_index_that_cannot_be_written_disturbs_no_flight(tmp_path, events, ho
             one.unlink()
         (tmp_path / INDEX).mkdir()
     blocker = sqlite3.connect(":memory:" if how == "no file" else tmp_path / INDEX, isolation_level=None)
-    failures = Failures(time.time_ns)
-    with closing(blocker), RecordingsFolder(tmp_path, ALL, failures=failures) as index:
+    with closing(blocker):
         blocker.execute("BEGIN EXCLUSIVE")
-        index.begin()
-        sink = SessionFiles(settings(tmp_path), split=SPLIT, tell=index.recorded)
-        for event in events:
-            sink.log(event)
-        sink.close()  # while nobody can write to the index: nobody waits for it
-        eventually(lambda: failures.parts, what="it is said")
-        assert [(one.part, one.working) for one in failures.parts] == [("recordings index", False)]
-        assert "Error" not in failures.parts[0].reason, "it is said in words"
-        blocker.execute("ROLLBACK")
-        if how == "no file":
-            (tmp_path / INDEX).rmdir()
-        eventually(lambda: failures.parts[0].working, what="it works again")
+        with flying(tmp_path) as (sink, failures):
+            log(sink, events)  # while nobody can write to the index: nobody waits for it
+            eventually(lambda: failures.parts, what="it is said")
+            assert [(one.part, one.working) for one in failures.parts] == [("recordings index", False)]
+            assert "Error" not in failures.parts[0].reason, "it is said in words"
+            blocker.execute("ROLLBACK")
+            if how == "no file":
+                (tmp_path / INDEX).rmdir()
+            eventually(lambda: failures.parts[0].working, what="it works again")
     assert [one.file for one in read_index(tmp_path)] == NAMES, "what it missed it reads from the files"
 
 
@@ -206,15 +214,11 @@ def test_a_file_that_another_program_is_at_work_on_is_refused(tmp_path):
 
 def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
     """All that came after it would be written to a file that is in no folder."""
-    failures = Failures(time.time_ns)
-    with RecordingsFolder(tmp_path, ALL, failures=failures) as index:
-        index.begin()
-        sink = SessionFiles(settings(tmp_path), split=SPLIT, tell=index.recorded)
+    with flying(tmp_path) as (sink, failures):
         eventually(lambda: (tmp_path / INDEX).exists() and read_index(tmp_path), what="a row")
         for one in tmp_path.glob(f"{INDEX}*"):
             one.unlink()
-        for event in events:
-            sink.log(event)
+        log(sink, events, close=False)
         eventually((tmp_path / INDEX).exists, what="it is there again")
         sink.close()
         eventually(lambda: failures.parts[0].working, what="it works again")
@@ -310,36 +314,30 @@ def test_what_somebody_removed_does_not_count(copied):
     assert sorted(one.name for one in copied.glob("*.rrd")) == [NAMES[0], third]
 
 
-def test_only_files_of_ours_in_the_folder_are_removed(tmp_path, flown):
+def test_only_files_of_ours_in_the_folder_are_removed(copied):
     """What somebody put there, or a link to elsewhere, would be gone."""
-    folder = tmp_path / "flights"
-    folder.mkdir()
-    copytree(flown, folder, dirs_exist_ok=True)
-    kept = [folder / "mine.rrd", folder / "notes.txt", tmp_path / "other.rrd", folder / "hvt-a.rrd"]
+    other = copied.parent / "other.rrd"
+    kept = [copied / "mine.rrd", copied / "notes.txt", other, copied / "hvt-a.rrd"]
     for one in kept:
-        one.write_bytes((folder / NAMES[0]).read_bytes())
-    link = folder / "hvt-uav-1-20200101-000000.rrd"
-    link.symlink_to(tmp_path / "other.rrd")
-    with closing(sqlite3.connect(folder / INDEX)) as forged, forged:
+        one.write_bytes((copied / NAMES[0]).read_bytes())
+    link = copied / "hvt-uav-1-20200101-000000.rrd"
+    link.symlink_to(other)
+    with closing(sqlite3.connect(copied / INDEX)) as forged, forged:
         forged.execute(
             "INSERT INTO recordings SELECT '../other.rrd', edge, session, 0, 0, written_ns, 1, 1, 1, 0, 1, 1 "
             "FROM recordings LIMIT 1"
         )
         forged.execute("UPDATE recordings SET written_ns = 1600000000000000000")
-    look(folder, Retention((Limit(seconds=1.0),)), later_s=100, times=3)
+    look(copied, Retention((Limit(seconds=1.0),)), later_s=100, times=3)
     assert [one.name for one in kept if not one.exists()] == []
     assert link.is_symlink()
-    assert sorted(one.name for one in folder.glob("*-0*.rrd")) == [link.name]
+    assert sorted(one.name for one in copied.glob("*-0*.rrd")) == [link.name]
 
 
 def test_a_file_in_flight_is_never_removed(tmp_path, events):
     """The flight in the air would be lost: not even where another ground writes it."""
-    failures = Failures(time.time_ns)
-    with RecordingsFolder(tmp_path, ALL, failures=failures) as index:
-        index.begin()
-        sink = SessionFiles(settings(tmp_path), split=SPLIT, tell=index.recorded)
-        for event in events:
-            sink.log(event)
+    with flying(tmp_path) as (sink, _):
+        log(sink, events, close=False)
         eventually(lambda: len(read_index(tmp_path)) == 2, what="the index knows both")
         least = Retention((Limit(seconds=1.0), Limit(size_bytes=1)), Limit(seconds=1.0))
         assert [one.file for one in look(tmp_path, least, later_s=1e6)] == NAMES[1:]
@@ -367,26 +365,20 @@ def test_video_is_removed_and_the_rest_stays(tmp_path, events):
     assert [one.video for one in look(tmp_path)] == [False, False]
 
 
-def test_a_file_that_breaks_off_is_smaller_without_its_video(copied):
-    """Its footer, a row for each chunk, takes more than the pictures of a file that was cut short by a power cut."""
+@pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2 - 37], ends_its_reader])
+def test_a_damaged_file_is_stripped_and_smaller_without_its_video(copied, damage):
+    """Rerun's own program refuses it: each minute it was tried again.
+
+    The footer, a row for each chunk, takes more than the pictures of a file that was cut short by a power cut.
+    """
     path = copied / NAMES[0]
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2 - 37])
+    path.write_bytes(damage(path.read_bytes()))
     before = path.stat().st_size
-    first, _ = look(copied, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
-    assert (first.video, first.size_bytes < before) == (False, True)
+    first, second = look(copied, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
+    assert (first.video, second.video, first.size_bytes < before) == (False, False, True)
     assert first.size_bytes == path.stat().st_size
     assert Recording(path).video() == []
     assert Recording(path).blueprints == 1
-
-
-def test_a_damaged_file_is_stripped_too(copied):
-    """Rerun's own program refuses it, so its video stayed, and each minute it was tried again."""
-    path = copied / NAMES[0]
-    path.write_bytes(ends_its_reader(path.read_bytes()))
-    rows = look(copied, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
-    assert [one.video for one in rows] == [False, False]
-    assert Recording(path).video() == []
     assert Recording(path).boxes(20)
 
 
@@ -449,21 +441,14 @@ def test_a_killed_ground_leaves_an_index_that_goes_on(tmp_path, events, at):
         assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
 
 
-def test_a_ground_killed_while_it_removes_video_leaves_no_half_file(tmp_path, flown):
+def test_a_ground_killed_while_it_removes_video_leaves_no_half_file(copied):
     """Half a copy would stand in the place of the flight, or lie there for ever."""
-    folder = tmp_path / "flights"
-    folder.mkdir()
-    copytree(flown, folder, dirs_exist_ok=True)
-    half = folder / f"{NAMES[0]}.part"
-    half.write_bytes((folder / NAMES[0]).read_bytes()[:5000])  # as a kill in the middle leaves it
-    empty = folder / f"{STEM}-0003.rrd"
+    half, empty, other = (copied / one for one in (f"{NAMES[0]}.part", f"{STEM}-0003.rrd", "mine.rrd.part"))
+    half.write_bytes((copied / NAMES[0]).read_bytes()[:5000])  # as a kill in the middle leaves it
     empty.touch()
-    other = folder / "mine.rrd.part"
     other.write_text("mine")
-    assert [one.file for one in look(folder)] == NAMES
-    assert not half.exists()
-    assert not empty.exists()
-    assert other.exists()
+    assert [one.file for one in look(copied)] == NAMES
+    assert [one.exists() for one in (half, empty, other)] == [False, False, True]
 
 
 def test_it_is_a_sink_of_the_house(tmp_path):

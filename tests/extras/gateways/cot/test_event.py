@@ -9,6 +9,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_gateways.cot.event import CotEvent, Motion, Parent, Point, Sensor, default_types, read_types
+from hvt_gateways.cot.extra import CotExtra, CotOptions
 
 NOW_NS = 1_800_000_000_123_000_000
 EVENT = CotEvent(
@@ -184,7 +185,7 @@ def test_a_wrong_table_is_refused_in_one_sentence(tmp_path, content, said):
     if content is not None:
         file.write_bytes(content)
     with pytest.raises(UserError) as refusal:
-        read_types(file)
+        CotExtra().check_outputs(CotOptions(cot=("udp://239.2.3.1:6969",), cot_types=file))
     assert said in str(refusal.value)
     assert f"--cot-types {file}" in str(refusal.value)
     assert len(str(refusal.value)) < 400 + len(str(file))
