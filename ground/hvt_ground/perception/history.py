@@ -9,7 +9,6 @@ to exactly the pixels that the edge had.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
@@ -37,14 +36,13 @@ class History:
     gap_frames: int = 0
 
     def __post_init__(self) -> None:
-        self._frames: OrderedDict[int, Picture] = OrderedDict()
-        self._frame_bytes = 0
-        self._tracks: OrderedDict[int, Tracks] = OrderedDict()
+        self._frames: dict[int, Picture] = {}
+        self._tracks: dict[int, Tracks] = {}
 
     @property
     def size_bytes(self) -> int:
         """Bytes of the pictures held."""
-        return self._frame_bytes
+        return sum(one.nbytes for one in self._frames.values())
 
     @property
     def oldest_tracked(self) -> int | None:
@@ -57,33 +55,34 @@ class History:
         return next(reversed(self._tracks), None)
 
     def add_frame(self, frame_index: int, picture: Picture) -> None:
-        """Keep a decoded picture (not copied: nobody may write to it again)."""
-        _require_rising(next(reversed(self._frames), None), frame_index)
+        """Keep a decoded picture (not copied: nobody may write to it again); `ValueError` unless frames rise."""
+        newest = next(reversed(self._frames), -1)
+        if frame_index <= newest:
+            raise ValueError(
+                f"frame {frame_index} after frame {newest}: frames rise; clear() begins a session"
+            )
         self._frames[frame_index] = picture
-        self._frame_bytes += picture.nbytes
-        oldest = frame_index - self.reach_frames
-        while len(self._frames) > 1 and (self._frames_too_large() or next(iter(self._frames)) < oldest):
-            _, dropped = self._frames.popitem(last=False)
-            self._frame_bytes -= dropped.nbytes
+        while (oldest := next(iter(self._frames))) < frame_index and (
+            len(self._frames) > self.max_frames
+            or self.size_bytes > self.max_bytes
+            or oldest < frame_index - self.reach_frames
+        ):
+            del self._frames[oldest]
 
     def add_tracks(self, tracks: Tracks) -> None:
-        """Keep the tracks of a frame; an empty `Tracks` says that the frame was analyzed and held nothing."""
-        _require_rising(self.newest_tracked, tracks.frame_index)
-        self._tracks[tracks.frame_index] = tracks
-        if len(self._tracks) > self.track_frames:
-            self._tracks.popitem(last=False)
+        """Keep the tracks of a frame, in place of those that it has; frames before all that are held stay out.
 
-    def revise_tracks(self, tracks: Tracks) -> None:
-        """Revise a frame's tracks, whether it has some here or not; frames that are too old stay out."""
-        if self.oldest_tracked is None or tracks.frame_index > (self.newest_tracked or 0):
-            self.add_tracks(tracks)
-        elif tracks.frame_index in self._tracks:
-            self._tracks[tracks.frame_index] = tracks
-        elif tracks.frame_index > self.oldest_tracked:
-            self._tracks[tracks.frame_index] = tracks
-            self._tracks = OrderedDict(sorted(self._tracks.items()))
-            if len(self._tracks) > self.track_frames:
-                self._tracks.popitem(last=False)
+        An empty `Tracks` says that the frame was analyzed and held nothing.
+        """
+        index = tracks.frame_index
+        if index < (self.oldest_tracked or 0):
+            return
+        late = index < (self.newest_tracked or 0) and index not in self._tracks
+        self._tracks[index] = tracks
+        if late:
+            self._tracks = dict(sorted(self._tracks.items()))
+        if len(self._tracks) > self.track_frames:
+            del self._tracks[next(iter(self._tracks))]
 
     def picture(self, frame_index: int) -> Picture | None:
         """The picture of that frame as it was given; None if it was never decoded or is gone."""
@@ -124,19 +123,10 @@ class History:
         """Forget everything: a new session counts its frames from 0 again."""
         self._frames.clear()
         self._tracks.clear()
-        self._frame_bytes = 0
-
-    def _frames_too_large(self) -> bool:
-        return len(self._frames) > self.max_frames or self._frame_bytes > self.max_bytes
 
 
 def as_bgr(picture: Picture) -> Image:
     return picture.bgr() if isinstance(picture, YuvPicture) else picture
-
-
-def _require_rising(newest: int | None, frame_index: int) -> None:
-    if newest is not None and frame_index <= newest:
-        raise ValueError(f"frame {frame_index} after frame {newest}: frames rise; clear() begins a session")
 
 
 def _between(before: Tracks, after: Tracks, frame_index: int, *, share: float) -> Tracks:

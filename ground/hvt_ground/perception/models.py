@@ -124,7 +124,9 @@ class ModelFacts:
         return cls(
             default_confidence(config.detector) if confidence is None else confidence,
             calibrated,
-            calibrated if reader == DETECTOR else _reads_calibrated(reader),
+            calibrated
+            if reader == DETECTOR
+            else reader not in (None, NONE) and is_calibrated(reader, role="classifier"),
             trust_from(config.detector),
         )
 
@@ -236,7 +238,3 @@ class Models:
             provider=config.provider,
         )
         return detector, RetriedClassifier(open_one, "classifier", self.failures)
-
-
-def _reads_calibrated(classifier: str | None) -> bool:
-    return classifier is not None and classifier != NONE and is_calibrated(classifier, role="classifier")

@@ -402,7 +402,7 @@ class Pipeline:
         # Put the list at the frame of ``own`` on record.
         self._carry_merges()
         fused = self._parts.fusion.listed(own)
-        self._history.revise_tracks(fused.tracks)
+        self._history.add_tracks(fused.tracks)
         self._stills.update(self._now)
         return fused
 

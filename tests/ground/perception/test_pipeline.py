@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 from dataclasses import replace
 
@@ -62,6 +61,12 @@ class Rig:
         self.reader = options.pop("reader", SameAnswer())
         self.pipeline: Pipeline = pipeline_of(self.events.append, reader=self.reader, **options)
 
+    def look(self, pictures) -> Rig:
+        """Analyze them in turn."""
+        for picture in pictures:
+            self.pipeline.analyze(picture, hurry=False)
+        return self
+
     def of(self, kind) -> list:
         """Events of a kind."""
         return [one for one in self.events if isinstance(one, kind)]
@@ -73,34 +78,55 @@ def received(flight: Flight, index: int, sequence: int, **changes) -> ReceivedSt
     return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
 
+class Gated:
+    """Detects as another does, but waits to be let go each time, and sees nothing from one run on."""
+
+    class_names = CLASSES
+
+    def __init__(self, release, *, inner=None, taken=None, blind_from=None) -> None:
+        self._release, self._inner, self._taken = release, inner or RedSquares(), taken
+        self._blind_from = blind_from
+        self.seen: list[np.ndarray] = []
+
+    def detect(self, image_bgr):
+        """Once it is let go."""
+        self.seen.append(image_bgr)
+        blind = self._blind_from is not None and len(self.seen) >= self._blind_from
+        if self._taken is not None:
+            self._taken.release()
+        assert self._release.acquire(timeout=60)
+        return self._inner.detect(np.zeros_like(image_bgr) if blind else image_bgr)
+
+
+def news_of(*, come: bool = True) -> threading.Event:
+    """Set where there always are some."""
+    news = threading.Event()
+    if come:
+        news.set()
+    return news
+
+
 def test_boxes_go_on_over_pictures_that_were_passed_over(pictures):
     """They stood still on each picture that the ground had no time for, while the camera moved on."""
     rig, looked_at = Rig(detect_every=1), Rig(detect_every=1)
-    for picture in pictures[:12]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig.look(pictures[:12])
     for picture in pictures[12:15]:
         rig.pipeline.pass_over(picture.frame_index, picture.capture_ns)
-    rig.pipeline.analyze(pictures[15], hurry=False)
-    for picture in pictures[:16]:
-        looked_at.pipeline.analyze(picture, hurry=False)
+    rig.look([pictures[15]])
+    looked_at.look(pictures[:16])
     seen, expected = rig.of(Overlay), looked_at.of(Overlay)
     assert [one.frame_index for one in seen] == list(range(16))
-    looked_ns = pictures[11].capture_ns
-    assert [one.looked_ns for one in seen] == [None] * 12 + [looked_ns] * 3 + [None], (
-        "else they pass for seen"
-    )
+    looked_ns = [None] * 12 + [pictures[11].capture_ns] * 3 + [None]
+    assert [one.looked_ns for one in seen] == looked_ns, "else they pass for seen"
     for one, right, still in zip(seen[12:15], expected[12:15], expected[11:14], strict=True):
         assert one.track_ids.tolist() == right.track_ids.tolist()
-        off_px = np.abs(one.boxes_base_px - right.boxes_base_px).max()
-        assert off_px < 1.5
-        assert off_px < np.abs(still.boxes_base_px - right.boxes_base_px).max()
+        off_px, stood_px = (np.abs(each.boxes_base_px - right.boxes_base_px).max() for each in (one, still))
+        assert off_px < min(1.5, stood_px)
 
 
 def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures):
     """Boxes would lag behind the picture or be missing from some frames."""
-    rig = Rig(detect_every=3)
-    for picture in pictures:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig(detect_every=3).look(pictures)
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == list(range(30))
     assert rig.pipeline.counts.detections_run == 10
@@ -126,27 +152,19 @@ def test_only_pictures_that_are_searched_are_converted(flight, monkeypatch):
 
 def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_now(pictures):
     """Beside a browser lists came a second late, and the page showed none on the picture of now."""
-    taken, release, news = threading.Semaphore(0), threading.Semaphore(0), threading.Event()
-
-    class Slow(RedSquares):
-        def detect(self, image_bgr):
-            taken.release()
-            assert release.acquire(timeout=60)
-            return super().detect(image_bgr)
-
-    rig, at_once = Rig(detect_every=5, detector=Slow(), detector_thread=DetectorThread()), Rig(detect_every=5)
-    news.set()  # there always are some
+    taken, release = threading.Semaphore(0), threading.Semaphore(0)
+    slow, at_once = Gated(release, taken=taken), Rig(detect_every=5)
+    rig = Rig(detect_every=5, detector=slow, detector_thread=DetectorThread())
+    at_once.look(pictures)
     for picture in pictures:
-        rig.pipeline.analyze(picture, hurry=False, news=news)
-        at_once.pipeline.analyze(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False, news=news_of())
         if picture.frame_index % 5 == 0:
             assert taken.acquire(timeout=60), "else the next would take its place"
         if picture.frame_index % 5 == 2:  # what began two pictures ago
             release.release()
             eventually(lambda: rig.pipeline.searching is False, what="it is found")
     lists, expected = rig.of(Overlay), at_once.of(Overlay)
-    assert [one.frame_index for one in lists] == list(range(30))
-    assert {one.looked_ns for one in lists} == {None}
+    assert [(one.frame_index, one.looked_ns) for one in lists] == [(index, None) for index in range(30)]
     for one, right in zip(lists, expected, strict=True):
         assert one.track_ids.tolist() == ([1] if one.frame_index > 2 else [])
         if one.frame_index % 5 >= 3:
@@ -157,19 +175,12 @@ def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_no
 
 def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
     """Boxes that nobody has compared with a picture for so long would pass for seen."""
-    release, news = threading.Semaphore(0), threading.Event()
-
-    class Hangs(NothingSeen):
-        def detect(self, image_bgr):
-            release.acquire(timeout=60)
-            return super().detect(image_bgr)
-
-    rig = Rig(detect_every=5, detector=Hangs(), detector_thread=DetectorThread())
-    news.set()
+    release = threading.Semaphore(1)
+    slow = Gated(release, inner=NothingSeen())
+    rig = Rig(detect_every=5, detector=slow, detector_thread=DetectorThread())
     for picture in pictures[:24]:
-        rig.pipeline.analyze(picture, hurry=False, news=news)
+        rig.pipeline.analyze(picture, hurry=False, news=news_of())
         if picture.frame_index == 0:
-            release.release()
             eventually(lambda: not rig.pipeline.searching, what="the first is searched")
     rig.pipeline.pass_over(pictures[24].frame_index, pictures[24].capture_ns)
     rig.pipeline.edge_step(tracks_at(25, {7: (10.0, 10.0, 30.0, 30.0)}), capture_ns=pictures[25].capture_ns)
@@ -180,49 +191,27 @@ def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
 
 def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures):
     """Where many edges share it each would be searched in a picture that is seconds old."""
-    go, seen, news = threading.Event(), [], threading.Event()
-
-    class Other(NothingSeen):
-        def detect(self, image_bgr):
-            assert go.wait(timeout=60)
-            return super().detect(image_bgr)
-
-    class Watched(NothingSeen):
-        def detect(self, image_bgr):
-            seen.append(image_bgr)
-            return super().detect(image_bgr)
-
-    thread = DetectorThread()
-    other = Rig(detect_every=5, detector=Other(), detector_thread=thread)
-    rig = Rig(detect_every=5, detector=Watched(), detector_thread=thread)
-    go.set()
-    news.set()
+    go, thread = threading.Semaphore(1), DetectorThread()
+    other = Rig(detect_every=5, detector=Gated(go, inner=NothingSeen()), detector_thread=thread)
+    watched = Gated(threading.Semaphore(9), inner=NothingSeen())
+    rig = Rig(detect_every=5, detector=watched, detector_thread=thread)
     for one in (other, rig):
-        one.pipeline.analyze(pictures[0], hurry=False, news=news)
+        one.pipeline.analyze(pictures[0], hurry=False, news=news_of())
     eventually(lambda: not (other.pipeline.searching or rig.pipeline.searching), what="both see")
-    go.clear()
-    other.pipeline.analyze(pictures[5], hurry=False, news=news)
+    other.pipeline.analyze(pictures[5], hurry=False, news=news_of())
     for picture in pictures[5:9]:
-        rig.pipeline.analyze(picture, hurry=False, news=news)
-    go.set()
+        rig.pipeline.analyze(picture, hurry=False, news=news_of())
+    go.release()
     eventually(lambda: not rig.pipeline.searching, what="it is searched")
-    np.testing.assert_array_equal(seen, [as_bgr(pictures[index].picture) for index in (0, 8)])
+    np.testing.assert_array_equal(watched.seen, [as_bgr(pictures[index].picture) for index in (0, 8)])
     assert rig.pipeline.counts.detections_run == 2
 
 
 def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(pictures):
     """After the last picture of a flight, or where the link pauses, stills would find no track at its frame."""
     release, news = threading.Semaphore(1), threading.Event()
-
-    class BlindAtLast(RedSquares):
-        def detect(self, image_bgr):
-            assert release.acquire(timeout=60)
-            return super().detect(
-                image_bgr if rig.pipeline.counts.detections_run == 1 else np.zeros_like(image_bgr)
-            )
-
-    rig = Rig(detect_every=5, detector=BlindAtLast(), detector_thread=DetectorThread())
-    rig.pipeline.analyze(pictures[0], hurry=False)
+    at_last = Gated(release, blind_from=2)
+    rig = Rig(detect_every=5, detector=at_last, detector_thread=DetectorThread()).look([pictures[0]])
     news.set()
     rig.pipeline.analyze(pictures[5], hurry=False, news=news)
     assert (rig.pipeline.take_late(), rig.pipeline.objects_detected) == (True, 1)
@@ -236,15 +225,8 @@ def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(picture
 @pytest.mark.parametrize("hangs_at", [0, 5])
 def test_while_the_detector_hangs_all_else_goes_on(flight, pictures, hangs_at):
     """The edge's boxes came with the next picture alone, and a flight that ended meanwhile gave out no still."""
-    release, runs = threading.Event(), itertools.count()
-
-    class Hangs(RedSquares):
-        def detect(self, image_bgr):
-            if next(runs) * 5 >= hangs_at:
-                assert release.wait(timeout=60)
-            return super().detect(image_bgr)
-
-    rig = Rig(detect_every=5, detector=Hangs(), detector_thread=DetectorThread())
+    release = threading.Semaphore(hangs_at // 5)
+    rig = Rig(detect_every=5, detector=(slow := Gated(release)), detector_thread=DetectorThread())
     worker = RealtimeWorker(
         lambda one, hurry, news: rig.pipeline.analyze(one, hurry=hurry, news=news),
         lambda tracks, at_ns: rig.pipeline.edge_step(tracks, capture_ns=at_ns),
@@ -258,17 +240,17 @@ def test_while_the_detector_hangs_all_else_goes_on(flight, pictures, hangs_at):
         worker.picture(pictures[0])
         eventually(lambda: worker.idle, what="the first is searched")
     worker.picture(pictures[hangs_at])
+    eventually(lambda: len(slow.seen) == hangs_at // 5 + 1, what="it hangs")
     worker.step(tracks_at(hangs_at + 1, {7: square_box(hangs_at + 1)}), pictures[hangs_at + 1].capture_ns)
     worker.still(received(flight, hangs_at, 0))
     eventually(lambda: rig.reader.had_base, what="the still is read")
-    assert rig.of(Overlay)[-1].frame_index == hangs_at + 1
-    assert rig.of(Overlay)[-1].origins
+    assert (rig.of(Overlay)[-1].frame_index, bool(rig.of(Overlay)[-1].origins)) == (hangs_at + 1, True)
     assert not worker.idle
     assert worker.close()
     rig.pipeline.end()
     assert [one.still_sequence for one in rig.of(Refinement)] == [0]
     assert rig.pipeline.counts.detections_run == hangs_at // 5 + 1
-    release.set()
+    release.release(9)
 
 
 def test_a_picture_that_was_never_searched_is_not_counted(pictures):
@@ -288,9 +270,7 @@ def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):
     """They had no box; five runs as often as one would take the whole processor."""
     search = ScaleSearch(RedSquares().detect, confidence=0.25)
     search.enlarged = True
-    rig = Rig(detect_every=3, search=search, detector=NothingSeen())
-    for picture in pictures:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig(detect_every=3, search=search, detector=NothingSeen()).look(pictures)
     assert rig.pipeline.counts.detections_run == 6, "frames 0, 9 and 18, and in vain: then every third again"
     np.testing.assert_allclose(rig.of(Overlay)[0].boxes_base_px[0], square_box(0), atol=6)
 
@@ -299,8 +279,7 @@ def test_the_vehicles_that_are_seen_tell_the_tilt(pictures):
     """Of kinds aslant every second one is wrong."""
     rig, taken = Rig(detect_every=3), []
     rig.pipeline.tilt.take = lambda tracks, _names, *, height_px: taken.append((len(tracks), height_px))
-    for picture in pictures:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig.look(pictures)
     assert taken == [(1, 192)] * 10
 
 
@@ -380,17 +359,7 @@ def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(
 
 def test_what_the_detector_shows_is_counted_without_what_the_edge_tells(pictures):
     """The edge would take its own tracks for what the ground sees, and stop sending them."""
-
-    class BlindAtLast(RedSquares):
-        """Its model fails after a while."""
-
-        runs = 0
-
-        def detect(self, image_bgr):
-            self.runs += 1
-            return super().detect(image_bgr if self.runs <= 5 else np.zeros_like(image_bgr))
-
-    rig = Rig(detect_every=3, detector=BlindAtLast())
+    rig = Rig(detect_every=3, detector=Gated(threading.Semaphore(99), blind_from=6))
     assert rig.pipeline.objects_detected == -1
     counts = []
     for picture in pictures:
@@ -447,11 +416,9 @@ def test_on_a_machine_that_is_always_behind_something_is_detected_now_and_then(p
 
 def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
     """The whole point: the sharp still says bus, and the track would go on being called car."""
-    rig = Rig()
-    for picture in pictures[:12]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig().look(pictures[:12])
     rig.pipeline.read([received(flight, 8, 0)])
-    rig.pipeline.analyze(pictures[12], hurry=False)
+    rig.look([pictures[12]])
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_before, refinement.class_after) == (1, "car", "bus")
     assert (refinement.still_sequence, refinement.edge_track_id, refinement.frame_index) == (0, 1, 11)
@@ -459,34 +426,20 @@ def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
     assert refinement.base_crop_bgr[16, 16, 2] > 150, "the base crop shows the square of frame 8"
     last = rig.of(Overlay)[-1]
     assert (last.base_classes, last.classes, last.refined.tolist()) == (("car",), ("bus",), [True])
-    assert (
-        rig.pipeline.counts.refined,
-        rig.pipeline.counts.class_changes,
-        dict(rig.pipeline.counts.outcomes),
-    ) == (
-        1,
-        1,
-        {"matched": 1},
-    )
+    counts = rig.pipeline.counts
+    assert (counts.refined, counts.class_changes, dict(counts.outcomes)) == (1, 1, {"matched": 1})
 
 
 def test_the_edge_hears_of_every_still_once(flight, pictures):
     """A lockstep edge would wait in vain; M3 would count an answer twice."""
-    rig = Rig()
-    for picture in pictures[:10]:
-        rig.pipeline.analyze(picture, hurry=False)
-    rig.pipeline.read(
-        [received(flight, 8, 0), received(flight, 9, 1, data=b"broken"), received(flight, 9, 2)]
-    )
+    rig = Rig().look(pictures[:10])
+    stills = [received(flight, 8, 0), received(flight, 9, 1, data=b"broken"), received(flight, 9, 2)]
+    rig.pipeline.read(stills)
     results = rig.pipeline.take_results()
-    # Those of one frame are read together; one that cannot be decoded is answered as no opinion.
-    assert sorted((one.still_sequence, one.class_name) for one in results) == [
-        (0, "bus"),
-        (1, ""),
-        (2, "bus"),
-    ]
     (track_id,) = rig.of(Overlay)[-1].track_ids.tolist()
-    assert {one.still_sequence: one.ground_track_id for one in results} == {0: track_id, 1: -1, 2: track_id}
+    # Those of one frame are read together; one that cannot be decoded is answered as no opinion.
+    said = sorted((one.still_sequence, one.class_name, one.ground_track_id) for one in results)
+    assert said == [(0, "bus", track_id), (1, "", -1), (2, "bus", track_id)]
     assert rig.pipeline.take_results() == []
     assert dict(rig.pipeline.counts.stills_dropped) == {"undecodable": 1}
     assert [one.level for one in rig.of(Notice)] == ["warning"]
@@ -502,8 +455,7 @@ def test_the_edge_hears_of_every_still_once(flight, pictures):
 )
 def test_a_still_that_lies_about_itself_is_dropped(flight, pictures, changes):
     """One message could make the ground reserve gigabytes, or end it."""
-    rig = Rig()
-    rig.pipeline.analyze(pictures[0], hurry=False)
+    rig = Rig().look([pictures[0]])
     rig.pipeline.read([received(flight, 0, 0, **changes)])
     assert dict(rig.pipeline.counts.stills_dropped) == {"undecodable": 1}
 
@@ -511,8 +463,7 @@ def test_a_still_that_lies_about_itself_is_dropped(flight, pictures, changes):
 def test_a_name_of_any_language_and_length_goes_back_to_the_edge(flight, pictures):
     """A classifier with names in Chinese would end the ground at its first still."""
     wordy = "乗用車\n" * 30
-    rig = Rig(reader=SameAnswer(class_names=("car", wordy)), edge_classes=("car", wordy))
-    rig.pipeline.analyze(pictures[0], hurry=False)
+    rig = Rig(reader=SameAnswer(class_names=("car", wordy)), edge_classes=("car", wordy)).look([pictures[0]])
     rig.pipeline.read([received(flight, 0, 0)])
     (result,) = rig.pipeline.take_results()
     assert len(result.class_name.encode()) <= 64
@@ -521,9 +472,7 @@ def test_a_name_of_any_language_and_length_goes_back_to_the_edge(flight, picture
 
 def test_a_still_that_nobody_can_read_is_shown_all_the_same(flight, pictures):
     """Without a classifier the operator would not even see the sharp picture."""
-    rig = Rig(reader=SameAnswer(knows=False))
-    for picture in pictures[:6]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig(reader=SameAnswer(knows=False)).look(pictures[:6])
     rig.pipeline.read([received(flight, 4, 0)])
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_before, refinement.class_after) == (None, "car", "car")
@@ -533,9 +482,7 @@ def test_a_still_that_nobody_can_read_is_shown_all_the_same(flight, pictures):
 
 def test_what_still_waits_at_the_end_is_given_out(flight, pictures):
     """The last stills of a flight would be missing from its recording."""
-    rig = Rig()
-    for picture in pictures[:3]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig().look(pictures[:3])
     rig.pipeline.read([received(flight, 9, 0)])  # its frame will not come
     assert rig.of(Refinement) == []
     rig.pipeline.end()
@@ -573,9 +520,7 @@ def residual(
 
 def test_a_residual_is_undone_on_the_frame_that_it_names(flight, pictures):
     """The still would be painted onto another moment: garbage that looks like a picture."""
-    rig = Rig()
-    for picture in pictures[:12]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig().look(pictures[:12])
     still = residual(flight, pictures, 6, 0)
     rig.pipeline.read([still])
     (refinement,) = rig.of(Refinement)
@@ -591,37 +536,29 @@ def test_a_residual_is_undone_on_the_frame_that_it_names(flight, pictures):
 
 def test_a_residual_whose_frame_is_not_at_hand_is_asked_for_again_once(flight, pictures):
     """The operator would never see the still; or the edge would send it for ever."""
-    rig = Rig()
-    for picture in [*pictures[:5], *pictures[7:12]]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig().look([*pictures[:5], *pictures[7:12]])
     lost = residual(flight, pictures, 6, 4)
     wrong = residual(flight, pictures, 8, 5, parameters={"b": 1}, data=lost.data)
     rig.pipeline.read([lost, wrong])
-    rig.pipeline.analyze(pictures[12], hurry=False)
+    rig.look([pictures[12]])
     rig.pipeline.end()
     results = rig.pipeline.take_results()
-    assert [(one.still_sequence, one.track_id, one.class_name, one.again) for one in results] == [
-        (4, 1, "", True),
-        (5, 1, "", True),
-    ]
+    said = [(one.still_sequence, one.track_id, one.class_name, one.again) for one in results]
+    assert said == [(4, 1, "", True), (5, 1, "", True)]
     assert dict(rig.pipeline.counts.stills_dropped) == {"base_missing": 2}
-    assert [one.text.partition(":")[0] for one in rig.of(Notice)] == [
-        "still 4 is asked for again",
-        "still 5 is asked for again",
-    ]
+    notices = [one.text.partition(":")[0] for one in rig.of(Notice)]
+    assert notices == [f"still {number} is asked for again" for number in (4, 5)]
     assert rig.of(Refinement) == []
 
 
 def test_a_residual_before_its_frame_waits_for_it(flight, pictures):
     """Each residual that overtakes its frame in the decoder's queue would cost an intra still more."""
-    rig = Rig()
-    for picture in pictures[:6]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig().look(pictures[:6])
     rig.pipeline.read([residual(flight, pictures, 7, 0), residual(flight, pictures, 8, 1)])
     assert rig.pipeline.take_results() == []
-    rig.pipeline.analyze(pictures[6], hurry=False)
+    rig.look([pictures[6]])
     assert rig.pipeline.take_results() == []
-    rig.pipeline.analyze(pictures[7], hurry=False)
+    rig.look([pictures[7]])
     (result,) = rig.pipeline.take_results()
     assert (result.still_sequence, result.class_name, result.again) == (0, "bus", False)
     rig.pipeline.analyze(pictures[9], hurry=False)  # frame 8 was lost
@@ -631,8 +568,7 @@ def test_a_residual_before_its_frame_waits_for_it(flight, pictures):
 
 def test_stills_that_wait_are_bounded(flight, pictures):
     """A peer that names frames of the future would fill the memory."""
-    rig = Rig()
-    rig.pipeline.analyze(pictures[0], hurry=False)
+    rig = Rig().look([pictures[0]])
     one = residual(flight, pictures, 5, 0)
     rig.pipeline.read([ReceivedStill(replace(one.header, sequence=i), one.data) for i in range(70)])
     assert [result.still_sequence for result in rig.pipeline.take_results()] == list(range(6))
@@ -640,12 +576,10 @@ def test_stills_that_wait_are_bounded(flight, pictures):
 
 def test_a_reader_that_wants_the_picture_gets_it(flight, pictures):
     """Re-detection would be given a still without surroundings, and say nothing."""
-    rig = Rig(reader=SameAnswer(wants_base=True))
-    for picture in pictures[:4]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig(reader=SameAnswer(wants_base=True)).look(pictures[:4])
     rig.pipeline.read([received(flight, 5, 0)])
     assert rig.reader.had_base == []
-    rig.pipeline.analyze(pictures[4], hurry=False)
+    rig.look([pictures[4]])
     rig.pipeline.analyze(pictures[6], hurry=False)  # frame 5 has no picture: that of frame 4 serves
     assert rig.reader.had_base == [True]
 
@@ -655,18 +589,14 @@ def test_a_reader_that_wants_the_picture_gets_it(flight, pictures):
 
 def test_each_object_in_a_still_gets_its_own_answer(flight, pictures):
     """The neighbours in a shared still would stay unrefined, and the edge would send them again."""
-    rig = Rig()
-    for picture in pictures[:10]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig().look(pictures[:10])
     here = square_box(8)
     rig.pipeline.edge_step(tracks_at(8, {1: here, 7: (200.0, 20.0, 240.0, 60.0)}))
     also = (AlsoShown(track_id=7, box_source_px=(200.0, 20.0, 240.0, 60.0)),)
     rig.pipeline.read([received(flight, 8, 3, also=also)])
     results = rig.pipeline.take_results()
-    assert [(one.still_sequence, one.track_id, one.ground_track_id, one.class_name) for one in results] == [
-        (3, 1, 1, "bus"),
-        (3, 7, 2, "bus"),
-    ]
+    said = [(one.still_sequence, one.track_id, one.ground_track_id, one.class_name) for one in results]
+    assert said == [(3, 1, 1, "bus"), (3, 7, 2, "bus")]
     shown = rig.of(Refinement)
     assert [(one.edge_track_id, one.track_id, one.still_sequence) for one in shown] == [(1, 1, 3), (7, 2, 3)]
     assert shown[1].box_base_px == (200.0, 20.0, 240.0, 60.0)
@@ -680,9 +610,7 @@ def test_new_objects_and_boxes_of_a_still_enter_the_list(flight, pictures):
     new = (250.0, 10.0, 280.0, 40.0)
     found = Detections(np.array([new], np.float32), np.array([0.8], np.float32), np.array([1], np.int32))
     x1, y1, x2, y2 = square_box(8)
-    rig = Rig(reader=SameAnswer(found=found, at=(x1 + 8, y1, x2 + 8, y2)))
-    for picture in pictures[:9]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig(reader=SameAnswer(found=found, at=(x1 + 8, y1, x2 + 8, y2))).look(pictures[:9])
     before = rig.pipeline.list_at(9).boxes_base_px[0, 0]
     rig.pipeline.read([received(flight, 8, 0)])
     last = rig.pipeline.list_at(9)
@@ -733,9 +661,7 @@ def test_what_has_left_the_picture_is_listed_no_more(pictures):
 def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures):
     """On a bad base nothing would ever be refined: the ground has no track there."""
     far = (220.0, 20.0, 250.0, 50.0)
-    rig = Rig()
-    for picture in pictures[:9]:
-        rig.pipeline.analyze(picture, hurry=False)
+    rig = Rig().look(pictures[:9])
     rig.pipeline.edge_step(tracks_at(6, {32: far}))
     crop = (216, 16, 254, 54)
     data = cv2.imencode(".jpg", flight.pictures[6][16:54, 216:254])[1].tobytes()
@@ -743,22 +669,21 @@ def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures)
     rig.pipeline.read([still])
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_after) == (2, "bus")
-    rig.pipeline.analyze(pictures[9], hurry=False)
+    rig.look([pictures[9]])
     last = rig.of(Overlay)[-1]
     assert (last.classes[1], last.refined.tolist(), last.origins[1]) == ("bus", [False, True], "edge")
 
 
 def test_a_step_of_a_tick_without_a_picture_is_shown(pictures):
     """At one frame a second on the base the boxes would move once a second."""
-    rig = Rig()
-    rig.pipeline.analyze(pictures[0], hurry=False)
-    rig.pipeline.analyze(pictures[5], hurry=False)
+    rig = Rig().look([pictures[0]])
+    rig.look([pictures[5]])
     rig.pipeline.edge_step(tracks_at(8, {31: square_box(8)}), capture_ns=123)
     rig.pipeline.edge_step(tracks_at(7, {31: square_box(7)}))  # older than the last
     rig.pipeline.analyze(pictures[7], hurry=False)  # its picture was late
-    rig.pipeline.analyze(pictures[10], hurry=False)
+    rig.look([pictures[10]])
     rig.pipeline.edge_step(tracks_at(2**32 - 1, {31: square_box(10)}))  # nonsense: nothing could follow it
-    rig.pipeline.analyze(pictures[11], hurry=False)
+    rig.look([pictures[11]])
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == [0, 5, 8, 10, 11]
     assert overlays[2].capture_ns == 123
@@ -781,7 +706,7 @@ def test_looking_ahead_tells_what_would_be_shown_and_changes_nothing(pictures):
     """A study that asks at every frame would measure another ground than the one that flies."""
     plain, asked = Rig(detect_every=5), Rig(detect_every=5)
     for rig in (plain, asked):
-        rig.pipeline.analyze(pictures[0], hurry=False)
+        rig.look([pictures[0]])
         for picture in pictures[1:20]:
             if rig is asked:
                 ahead = rig.pipeline.list_at(picture.frame_index + 3)

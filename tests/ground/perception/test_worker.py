@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -37,23 +38,41 @@ def still(flight: Flight, index: int, sequence: int) -> ReceivedStill:
 
 
 class Rig:
-    """A worker that notes what it does, and waits in the first of it until it may go on."""
+    """A worker that notes what it does, and waits in the first of it until it may go on.
 
-    def __init__(self) -> None:
+    ``at`` are pictures during which something else happens.
+    """
+
+    def __init__(self, at: dict[int, Callable[[], None]] | None = None) -> None:
         self.done: list[tuple[str, Any]] = []
         self.begun, self.go_on = threading.Event(), threading.Event()
         self.now_s = 0.0
+        self.waits: dict[int, bool] = {}
+        """Pictures, and whether their detection was waited for."""
+        self._at = at or {}
         self.worker = patient_worker(
-            lambda one, hurry, _newer: self._note("hurry" if hurry else "picture", one.frame_index),
+            self._analyze,
             lambda tracks, _at_ns: self._note("step", tracks.frame_index),
             lambda stills: self._note("stills", [one.header.sequence for one in stills]),
             clock=lambda: self.now_s,
         )
 
+    def _analyze(self, one: DecodedFrame, hurry: bool, news: threading.Event | None) -> None:  # noqa: FBT001
+        assert news is not None
+        self.waits[one.frame_index] = not news.is_set()
+        self._note("hurry" if hurry else "picture", one.frame_index)
+        self._at.get(one.frame_index, lambda: None)()
+
     def _note(self, what: str, which: object) -> None:
         self.done.append((what, which))
         self.begun.set()
         assert self.go_on.wait(timeout=60)
+
+    def pictures(self, *indices: int) -> None:
+        """They come while the first of them is looked at."""
+        for index in indices:
+            self.worker.picture(picture(index))
+            assert self.begun.wait(timeout=60)
 
     def finish(self) -> list[tuple[str, Any]]:
         """All that it did."""
@@ -70,22 +89,19 @@ def test_pictures_come_between_the_stills_of_two_frames(flight):
     for sequence, index in enumerate((0, 0, 1, 2)):
         rig.worker.still(still(flight, index, sequence))
     assert rig.begun.wait(timeout=60)
-    rig.worker.picture(picture(7))
+    rig.pictures(7)
     rest = rig.finish()
-    first = rest.index(("picture", 7))
-    read = [one for _, which in rest if isinstance(which, list) for one in which]
-    assert read == [0, 1, 2, 3]
-    assert first == 1, "the first frame's are in hand when it comes, the others wait for it"
+    assert [one for _, which in rest if isinstance(which, list) for one in which] == [0, 1, 2, 3]
+    assert rest[1] == ("picture", 7), "the first frame's are in hand when it comes, the others wait for it"
 
 
 def test_a_report_of_tracks_lets_the_pictures_before_it_go_first():
     """The boxes of a former picture stood on all that came while the detector ran."""
     rig = Rig()
-    rig.worker.picture(picture(1))
-    assert rig.begun.wait(timeout=60)
+    rig.pictures(1)
     for index in (2, 3):
         rig.worker.step(Tracks.none(index), index)
-        rig.worker.picture(picture(index))
+        rig.pictures(index)
     rig.worker.step(Tracks.none(4), 4)
     order = [which if kind == "step" else -which for kind, which in rig.finish()]  # pictures count below 0
     assert order[-1] == 4
@@ -95,73 +111,39 @@ def test_a_report_of_tracks_lets_the_pictures_before_it_go_first():
 def test_pictures_that_waited_for_long_are_passed_over():
     """A ground of too many edges would show every one of them ever later, and hold them all until it could look."""
     rig = Rig()
-    rig.worker.picture(picture(0))
-    assert rig.begun.wait(timeout=60)
-    for index in (1, 2, 3):
-        rig.worker.picture(picture(index))
+    rig.pictures(0, 1, 2, 3)
     rig.now_s += 0.7
-    rig.worker.picture(picture(4))
+    rig.pictures(4)
     assert rig.worker.untracked == 3, "at once"
     assert rig.finish() == [("picture", 0), ("picture", 4)]
 
 
 def test_pictures_may_be_passed_over_while_one_before_them_is_looked_at():
     """On a busy machine it ended the session with an error, and its recording broke in two."""
-    begun, go_on, looked, now_s = threading.Event(), threading.Event(), [], [0.0]
 
-    def analyze(one: DecodedFrame, _hurry: object, _news: object) -> None:
-        looked.append(one.frame_index)
-        if one.frame_index == 0:
-            begun.set()
-            assert go_on.wait(timeout=60)
-        if one.frame_index == 1:
-            now_s[0] += 0.7
-            worker.picture(picture(4))
+    def later() -> None:
+        rig.now_s += 0.7
+        rig.pictures(4)
 
-    worker = patient_worker(analyze, lambda *_: None, lambda _stills: None, clock=lambda: now_s[0])
-    worker.picture(picture(0))
-    assert begun.wait(timeout=60)
-    for index in (1, 2, 3):
-        worker.picture(picture(index))
-    go_on.set()
-    eventually(lambda: looked[-1] == 4, what="the newest is looked at")
-    assert worker.close()
-    worker.raise_error()
-    assert (looked, worker.untracked) == ([0, 1, 4], 2)
+    rig = Rig({1: later})
+    rig.pictures(0, 1, 2, 3)
+    assert rig.finish() == [("picture", 0), ("hurry", 1), ("picture", 4)]
+    assert rig.worker.untracked == 2
 
 
 def test_detection_is_for_the_newest_picture():
     """Boxes would be shown late, one detection after the other, on a machine that is a little behind."""
     rig = Rig()
-    rig.worker.picture(picture(0))
-    assert rig.begun.wait(timeout=60)
-    for index in (1, 2, 3):
-        rig.worker.picture(picture(index))
+    rig.pictures(0, 1, 2, 3)
     assert rig.finish() == [("picture", 0), ("hurry", 1), ("hurry", 2), ("picture", 3)]
 
 
 def test_a_still_that_comes_while_an_older_picture_is_tracked_waits_for_no_detection(flight):
     """It waited until the detector was done with the next picture, or for good where that hangs."""
-    begun, go_on, waits = threading.Event(), threading.Event(), {}
-
-    def analyze(one: DecodedFrame, _hurry: object, news: threading.Event | None) -> None:
-        assert news is not None
-        waits[one.frame_index] = not news.is_set()
-        if one.frame_index == 0:
-            begun.set()
-            assert go_on.wait(timeout=60)
-        if one.frame_index == 1:
-            worker.still(still(flight, 1, 0))
-
-    worker = patient_worker(analyze, lambda _tracks, _at_ns: None, lambda _stills: None)
-    worker.picture(picture(0))
-    assert begun.wait(timeout=60)
-    for index in (1, 2):
-        worker.picture(picture(index))
-    go_on.set()
-    eventually(lambda: worker.idle, what="all is done")
-    assert worker.close()
-    assert not waits[2]
+    rig = Rig({1: lambda: rig.worker.still(still(flight, 1, 0))})
+    rig.pictures(0, 1, 2)
+    rig.finish()
+    assert not rig.waits[2]
 
 
 @pytest.mark.parametrize("slow", [False, True])
@@ -187,12 +169,10 @@ def test_large_pictures_that_wait_have_a_bound_in_bytes():
     """A picture of 8192x4352 costs an edge a hundred bytes, and the ground 53 MB: twelve would fill it."""
     rig = Rig()
     large = np.broadcast_to(np.uint8(0), (4352, 8192, 1))
-    rig.worker.picture(picture(0))
-    assert rig.begun.wait(timeout=60)
+    rig.pictures(0)
     for index in range(1, 6):
         rig.worker.picture(DecodedFrame(index, index, index, large))
-    for index in range(6, 9):
-        rig.worker.picture(picture(index))
+    rig.pictures(6, 7, 8)
     assert rig.worker.untracked == 4
     assert [which for _, which in rig.finish()] == [0, 5, 6, 7, 8]
 

@@ -54,6 +54,16 @@ class Rig(ReceiverRig):
         """As they were given."""
         return self.sinks
 
+    def take(self, *items: Received) -> None:
+        """All of it is handled and seen."""
+        self.put(*items)
+        self.settle()
+
+    @property
+    def decoded(self) -> tuple[int, int]:
+        """Frames that came in the open session, and those of them that were decoded."""
+        return self.session.reception.frames, self.session.frames_decoded
+
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
@@ -129,8 +139,7 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
             flight.still(9, 1),
             flight.status(base=30, roi=2),
         ]
-        rig.put(*items)
-        rig.settle()
+        rig.take(*items)
         session = rig.receiver.session
         assert (session.reception.frames, session.frames_decoded) == (30, 30)
         assert session.reception.stills == 2
@@ -159,8 +168,7 @@ def test_the_edges_tracks_are_counted_and_shown(pace):
         items = [*bases(flight, *range(6)), *steps[:2], *bases(flight, *range(6, 12)), steps[2]]
         items += bases(flight, *range(12, 20))
         for item in items:
-            rig.put(item)
-            rig.settle()
+            rig.take(item)
         session = rig.receiver.session
         assert (session.reception.steps, session.reception.ledger.messages(Account.META)) == (3, 3)
         assert session.reception.ledger.line_bytes == line_bytes(items)
@@ -176,26 +184,22 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         good = [flight.step(index, {31: square_box(index)}) for index in (2, 3)]
         rig.put(*bases(flight, 0, 1, 2, 3), good[0], good[0])
         rig.put(flight.step(4, {31: square_box(4)}, boxes=b"\xff" * 40, reference=-1))
-        rig.put(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
-        rig.settle()
+        rig.take(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
         session = rig.receiver.session
         assert (session.reception.steps, session.pipeline.counts.steps_used) == (2, 1)
         assert rig.receiver.receiver.unusable == 3
-        rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
-        rig.settle()
+        rig.take(*bases(flight, *range(4, 10)), flight.status(base=10))
         assert session.reception.analyzed[0] == 9
 
 
 def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
     """One lost message would freeze the picture, or fill it with garbage that looks like a picture."""
     with Rig(flight) as rig:
-        rig.put(*bases(flight, 0, 1, 2, *range(5, 14)))
-        rig.settle()
+        rig.take(*bases(flight, 0, 1, 2, *range(5, 14)))
         session = rig.receiver.session
         assert session.frames_decoded == 3
         eventually(lambda: rig.port.keyframe_requests >= 1)
-        rig.put(*bases(flight, *range(14, 30)))
-        rig.settle()
+        rig.take(*bases(flight, *range(14, 30)))
         assert session.frames_decoded == 3 + 10
         assert session.reception.frames == 28
         assert session.reception.analyzed[0] == 29
@@ -218,14 +222,12 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
     with Rig(flight) as rig:
         rig.put(*bases(flight, 0, 1, 2, 1, 0), nonsense, other, later)
         rig.put(flight.still(1, 0), flight.still(1, 0), stranger.still(0, 5), *bases(stranger, 1))
-        rig.put(status := flight.status(base=3, roi=1), status)
-        rig.settle()
+        rig.take(status := flight.status(base=3, roi=1), status)
         session = rig.receiver.session
         assert (session.reception.frames, session.frames_decoded, session.reception.stills) == (3, 3, 1)
         assert session.reception.ledger.messages(Account.META) == 1
         assert rig.receiver.receiver.unusable == 4
-        rig.put(broken)
-        rig.settle()
+        rig.take(broken)
         eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.put(flight.base(3))  # the very unit, whole this time
         rig.settle()
@@ -264,8 +266,9 @@ def test_whatever_comes_damaged_is_counted_and_costs_no_frame_and_no_byte(flight
             rig.put(*items)
             wrong = [one for item in items for one in spoilt(item, rng)]
             wrong.append(Received("hvt/uav-1/status", rng.randbytes(300), b"", "", 1))
-            rig.put(*wrong, *(Received(f"hvt/{key}", b"x", b"", "", 1) for key in ("UAV_1/base", "uav-1/no")))
-            rig.settle()
+            rig.take(
+                *wrong, *(Received(f"hvt/{key}", b"x", b"", "", 1) for key in ("UAV_1/base", "uav-1/no"))
+            )
             good += items
             bad += len(wrong)
         reception = rig.session.reception
@@ -279,8 +282,7 @@ def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
     """The gallery would show it twice, or the two sides' accounts of the line would differ."""
     item = flight.still(1, 0)
     with Rig(flight) as rig:
-        rig.put(*bases(flight, 0, 1, 2))
-        rig.settle()
+        rig.take(*bases(flight, 0, 1, 2))
         session = rig.receiver.session
         before = session.reception.ledger.line_bytes
         later = flight.still(1, 0, send_delay_ns=1_030_000_000)
@@ -290,8 +292,7 @@ def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
             (later, 2),
             (later, 2),
         ):  # repeated, somebody else's, not the edge's
-            rig.put(one)
-            rig.settle()
+            rig.take(one)
             assert session.reception.ledger.messages(Account.ROI) == copies
             assert session.reception.ledger.line_bytes - before == pytest.approx(
                 copies * line_bytes([item]), abs=8
@@ -312,8 +313,7 @@ def test_a_second_edge_of_one_id_is_told_of_and_not_shown(flight, caplog):
             items = [flight.base(index)]
             if index > 0:
                 items += other.base(index - 1), other.still(index, index), other.status(base=index)
-            rig.put(*(replace(item, received_ns=now_ns) for item in items))
-            rig.settle()
+            rig.take(*(replace(item, received_ns=now_ns) for item in items))
             now_ns += 66_000_000
         assert rig.opened == [session := rig.receiver.session]
         assert session.info.session_id == flight.session_id
@@ -335,15 +335,12 @@ def test_a_session_that_the_edge_does_not_know_ends_nothing():
     """In any pause of the edge a forged keyframe would close the recording, and hide the drone."""
     flight, forged = Flight(30, keyframes=(20,)), Flight(8, keyframes=range(8))
     with Rig(flight) as rig:
-        rig.put(*bases(flight, *range(5)))
-        rig.settle()
+        rig.take(*bases(flight, *range(5)))
         time.sleep(1.1)  # a pause in which a restart would be believed
         for index in range(8):
-            rig.put(forged.base(index))
-            rig.settle()
+            rig.take(forged.base(index))
         eventually(lambda: rig.port.keyframe_requests >= 1)
-        rig.put(*bases(flight, *range(5, 30)))
-        rig.settle()
+        rig.take(*bases(flight, *range(5, 30)))
         assert rig.opened == [session := rig.receiver.session]
         # Shown again from the keyframe that was asked for.
         assert (session.reception.frames, session.frames_decoded) == (30, 15)
@@ -357,8 +354,7 @@ def test_an_edge_that_restarts_gets_a_session_of_its_own(flight):
         rig.settle()
         rig.port.flight = second
         time.sleep(1.1)  # the first one is silent: it is over
-        rig.put(*bases(second, *range(8)), second.still(2, 0))
-        rig.settle()
+        rig.take(*bases(second, *range(8)), second.still(2, 0))
         assert [one.info.session_id for one in rig.opened] == [flight.session_id, second.session_id]
         assert rig.receiver.session is rig.opened[1]
         assert rig.opened[1].frames_decoded == 8
@@ -373,15 +369,13 @@ def test_sessions_that_begin_again_and_again_are_bounded(flight):
     with Rig(edge, clock=lambda: now_ns) as rig:
         for number in range(42):
             edge.session_id = 7000 + number
-            rig.put(replace(edge.base(0), received_ns=now_ns))
-            rig.settle()
+            rig.take(replace(edge.base(0), received_ns=now_ns))
             now_ns += 1_100_000_000
         assert len(rig.opened) == 39  # thirty at once, then one in five seconds
         assert rig.receiver.receiver.unusable == 3
         rig.port.flight = flight
         now_ns += 5_000_000_000
-        rig.put(*(replace(one, received_ns=now_ns) for one in bases(flight, *range(10))))
-        rig.settle()
+        rig.take(*(replace(one, received_ns=now_ns) for one in bases(flight, *range(10))))
         assert rig.session.info.session_id == flight.session_id
         assert rig.session.frames_decoded == 10
 
@@ -390,11 +384,9 @@ def test_a_session_ends_when_all_of_it_has_arrived(flight):
     """``--once`` would cut the last pictures off, or never end."""
     with Rig(flight, ended_patience_s=3600) as rig:
         rig.put(*bases(flight, *range(5)))
-        rig.put(flight.status(base=6, roi=1, state="ended"))
-        rig.settle()
+        rig.take(flight.status(base=6, roi=1, state="ended"))
         assert not rig.receiver.idle, "a picture and a still are on their way"
-        rig.put(flight.base(5))
-        rig.settle()
+        rig.take(flight.base(5))
         assert not rig.receiver.idle
         rig.put(flight.still(3, 0))
         eventually(lambda: rig.ended)
@@ -420,11 +412,9 @@ def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
     """The first stills of every flight would be skipped as a stranger's, and the two accounts differ by them."""
     other = Flight(8)
     with Rig(flight) as rig:
-        rig.put(flight.still(0, 0), other.still(0, 0))
-        rig.settle()
+        rig.take(flight.still(0, 0), other.still(0, 0))
         assert rig.receiver.receiver.unusable == 0
-        rig.put(*bases(flight, *range(6)))
-        rig.settle()
+        rig.take(*bases(flight, *range(6)))
         session = rig.receiver.session
         assert (session.reception.stills, session.reception.frames) == (1, 6)
         assert session.reception.ledger.messages(Account.ROI) == 1
@@ -442,10 +432,9 @@ def test_the_class_of_a_still_may_be_a_place_in_the_list_of_its_session(flight):
             """Nothing to close."""
 
     with Rig(flight, sinks=[Shown()]) as rig:
-        rig.put(
+        rig.take(
             *bases(flight, *range(6)), flight.still(1, 0, class_name=1), flight.still(2, 1, class_name=99)
         )
-        rig.settle()
         assert (rig.session.reception.stills, rig.receiver.receiver.unusable) == (1, 1)
     (seen,) = (one for one in events if isinstance(one, Refinement))
     assert seen.header.class_name == flight.info().class_names[1]
@@ -461,10 +450,8 @@ def test_poses_that_come_before_their_session_is_open_are_taken(flight):
         return Received(f"hvt/{flight.info().edge}/pose", report(flight.info().started_ns).pack(), b"", "", 1)
 
     with Rig(flight) as rig:
-        rig.put(pose(0, encoder), pose(1, encoder), pose(0, of_another))
-        rig.settle()
-        rig.put(*bases(flight, *range(6)), pose(2, encoder))
-        rig.settle()
+        rig.take(pose(0, encoder), pose(1, encoder), pose(0, of_another))
+        rig.take(*bases(flight, *range(6)), pose(2, encoder))
         session = rig.receiver.session
         assert session.reception.ledger.messages(Account.META) == 3
         assert session.poses.has_pose
@@ -481,8 +468,7 @@ def test_a_lost_answer_does_not_lose_the_flight(flight):
         rig.port.flight = flight
         rig.put(*bases(flight, 3, 4))
         eventually(lambda: rig.port.keyframe_requests >= 1)
-        rig.put(*bases(flight, *range(5, 30)))
-        rig.settle()
+        rig.take(*bases(flight, *range(5, 30)))
         assert rig.session.info.session_id == flight.session_id
         assert rig.session.frames_decoded == 10
 
@@ -494,8 +480,7 @@ def test_video_that_this_ground_does_not_read_is_told_of_in_a_sentence(flight, c
         read = flight.info
         monkeypatch.setattr(flight, "info", lambda: replace(read(), codec="av1"))
         for index in range(0, 30, 5):
-            rig.put(flight.base(index))
-            rig.settle()
+            rig.take(flight.base(index))
         assert rig.receiver.idle
         assert (rig.port.requested, rig.port.keyframe_requests) == (1, 0)
     said = [one.getMessage() for one in caplog.records]
@@ -506,8 +491,7 @@ def test_video_that_this_ground_does_not_read_is_told_of_in_a_sentence(flight, c
 def test_a_flight_goes_on_after_an_outage(flight):
     """After ten seconds without a link the picture would never come back although the edge flies on."""
     with Rig(flight, patience_s=0.2) as rig:
-        rig.put(*bases(flight, *range(6)))
-        rig.settle()
+        rig.take(*bases(flight, *range(6)))
         rig.port.present.clear()
         eventually(lambda: rig.ended)
         assert rig.receiver.idle
@@ -515,8 +499,7 @@ def test_a_flight_goes_on_after_an_outage(flight):
         requests = rig.port.keyframe_requests
         rig.put(*bases(flight, *range(6, 10)))  # not one is missing, but the decoder has been closed
         eventually(lambda: rig.port.keyframe_requests > requests)
-        rig.put(*bases(flight, *range(10, 30)))
-        rig.settle()
+        rig.take(*bases(flight, *range(10, 30)))
         assert rig.receiver.session is not None
         assert rig.session.frames_decoded == 10
 
@@ -569,11 +552,9 @@ def test_a_still_before_its_frame_waits_for_its_track(flight):
     with Rig(
         flight, worker_of=partial(LockstepWorker, name="uav-1")
     ) as rig:  # a busy machine would pass frames over
-        rig.put(*bases(flight, 0, 1, 2), flight.still(6, 0))
-        rig.settle()
+        rig.take(*bases(flight, 0, 1, 2), flight.still(6, 0))
         assert rig.session.perceived.refined == 0
-        rig.put(*bases(flight, *range(3, 12)))
-        rig.settle()
+        rig.take(*bases(flight, *range(3, 12)))
         eventually(lambda: rig.session.perceived.refined == 1)
 
 
@@ -584,10 +565,9 @@ def test_lockstep_sees_every_frame_and_answers_every_still():
         flight = Flight(20, pace="lockstep")
         with Rig(flight, detector=RedSquares(takes_s=0.01)) as rig:
             for index in range(20):
-                rig.put(
+                rig.take(
                     flight.base(index), flight.still(index, index, data=b"no jpeg" if index == 7 else None)
                 )
-            rig.settle()
             session = rig.receiver.session
             assert session.perceived.detections_run == 20
             answered = [one.still_sequence for report in rig.port.reports for one in report.stills]
@@ -609,16 +589,13 @@ def test_another_picture_size_under_the_same_session_is_not_shown(flight):
     large = Flight(3, size=(384, 256))
     large.session_id = flight.session_id
     with Rig(flight) as rig:
-        rig.put(*bases(flight, 0, 1, 2))
-        rig.settle()
+        rig.take(*bases(flight, 0, 1, 2))
         forged = Flight(5, keyframes=(3,), size=(384, 256))
         forged.session_id = flight.session_id
-        rig.put(forged.base(3))
-        rig.settle()
+        rig.take(forged.base(3))
         assert rig.session.frames_decoded == 3
         eventually(lambda: rig.port.keyframe_requests >= 1)
-        rig.put(*bases(flight, *range(4, 30)))
-        rig.settle()
+        rig.take(*bases(flight, *range(4, 30)))
         assert rig.session.reception.analyzed[0] == 29
 
 
@@ -638,8 +615,7 @@ def test_the_summary_can_be_written_and_read():
     """Programs that compare runs would miss a field."""
     flight = Flight(10, pace="lockstep")  # whose clock is no matter
     with Rig(flight, reader=SameAnswer(knows=False)) as rig:
-        rig.put(*bases(flight, *range(10)), flight.still(2, 0), flight.still(3, 1, data=b"junk"))
-        rig.settle()
+        rig.take(*bases(flight, *range(10)), flight.still(2, 0), flight.still(3, 1, data=b"junk"))
     content = summary(rig.ended[0])
     assert content["stills"]["received"] == 2
     assert content["stills"]["unread"] == 1

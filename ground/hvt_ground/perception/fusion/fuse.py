@@ -40,7 +40,7 @@ gains 0.01 where the edge's class counts double.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -118,8 +118,6 @@ class Fusion:
         self._forget = max(1, round(FORGET_S * fps))
         self._missed = MissedDetections(edge_classes, fps=fps, still_frames=self._forget)
         self._entities: list[Entity] = []
-        self._by_own: dict[int, Entity] = {}
-        self._by_edge: dict[int, Entity] = {}
         self._own: OrderedDict[int, Tracks] = OrderedDict()
         self._next_id = 1
         self._stepped = -1
@@ -127,16 +125,12 @@ class Fusion:
 
     def known_as(self, edge_track_id: int) -> int | None:
         """The id that a track of the edge is listed under; None while it is not."""
-        entity = self._by_edge.get(edge_track_id)
+        entity = self._by_edge().get(edge_track_id)
         return None if entity is None else entity.id or None
 
     def own_at(self, frame_index: int) -> Tracks | None:
         """Our own tracks at that frame, or the newest before it that are remembered."""
-        exact = self._own.get(frame_index)
-        if exact is not None:
-            return exact
-        before = [index for index in self._own if index < frame_index]
-        return self._own[before[-1]] if before else None
+        return next((self._own[index] for index in reversed(self._own) if index <= frame_index), None)
 
     def take_merged(self) -> list[tuple[int, int]]:
         """Return and forget (id that stays, id that is gone) of listed entities that turned out to be one."""
@@ -145,7 +139,7 @@ class Fusion:
 
     def end_scene(self, frame_index: int) -> None:
         """End all entities: another scene began with that frame. Steps of frames before it are ignored."""
-        self._entities, self._by_own, self._by_edge = [], {}, {}
+        self._entities = []
         if self._stepped >= 0:
             self._stepped = max(self._stepped, frame_index - 1)
 
@@ -154,8 +148,9 @@ class Fusion:
         self._own[own.frame_index] = own
         if len(self._own) > _REMEMBERED_OWN:
             self._own.popitem(last=False)
+        by_own = self._by_own()
         for row, own_id in enumerate(own.ids.tolist()):
-            entity = self._by_own.get(own_id)
+            entity = by_own.get(own_id)
             if entity is None:
                 entity = self._add(Entity(own_id=own_id, born=int(own.born_frames[row])))
             entity.born = min(entity.born, int(own.born_frames[row]))
@@ -178,19 +173,19 @@ class Fusion:
             self._rules = replace(self._rules, patience=self._patience(frame_index - self._stepped))
         self._stepped = frame_index
         listed = {int(step.ids[row]): row for row in _usable(step, classes=len(self._edge_classes))}
-        fresh = [row for edge_id, row in listed.items() if edge_id not in self._by_edge]
-        for edge_id, entity in self._by_edge.items():
-            entity.missed = 0 if edge_id in listed else entity.missed + 1
-        for edge_id, row in listed.items():
-            if edge_id in self._by_edge:
-                self._update_edge(self._by_edge[edge_id], step, row)
-        self._associate(step, fresh)
+        for edge_id, entity in self._by_edge().items():
+            row = listed.pop(edge_id, None)
+            entity.missed = entity.missed + 1 if row is None else 0
+            if row is not None:
+                self._update_edge(entity, step, row)
+        self._associate(step, list(listed.values()))
         if own is not None:
             self._split(own, frame_index)
         self._update(own, frame_index)
         if own is not None:
-            self._note_own(own, frame_index)
-            self._missed.take(step, own, by_own=self._by_own)
+            by_own = self._by_own()
+            self._note_own(own, frame_index, by_own)
+            self._missed.take(step, own, by_own=by_own)
         return True
 
     def take_found(self, found: Detections, *, known: Tracks) -> None:
@@ -245,11 +240,13 @@ class Fusion:
 
     def _add(self, entity: Entity) -> Entity:
         self._entities.append(entity)
-        if entity.own_id is not None:
-            self._by_own[entity.own_id] = entity
-        if entity.edge_id is not None:
-            self._by_edge[entity.edge_id] = entity
         return entity
+
+    def _by_own(self) -> dict[int, Entity]:
+        return {one.own_id: one for one in self._entities if one.own_id is not None}
+
+    def _by_edge(self) -> dict[int, Entity]:
+        return {one.edge_id: one for one in self._entities if one.edge_id is not None}
 
     def _update_edge(self, entity: Entity, step: Tracks, row: int) -> None:
         frame_index, confidence = step.frame_index, float(step.confidences[row])
@@ -279,14 +276,8 @@ class Fusion:
             if entity is None:
                 entity = self._add(Entity(edge_id=edge_id, born=min(frame_index, int(step.born_frames[row]))))
             else:
-                self._rename(entity, edge_id)
+                entity.edge_id, entity.missed = edge_id, 0
             self._update_edge(entity, step, row)
-
-    def _rename(self, entity: Entity, edge_id: int) -> None:
-        if entity.edge_id is not None:
-            del self._by_edge[entity.edge_id]
-        entity.edge_id, entity.missed = edge_id, 0
-        self._by_edge[edge_id] = entity
 
     def _split(self, own: Tracks, frame_index: int) -> None:
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
@@ -304,11 +295,11 @@ class Fusion:
                 self._add(other)
                 entity.part_from_own()
 
-    def _note_own(self, own: Tracks, frame_index: int) -> None:
+    def _note_own(self, own: Tracks, frame_index: int, by_own: Mapping[int, Entity]) -> None:
         # Remember where our own boxes are at this frame: how they move from here moves the edge's box too.
         centres = (own.boxes_xyxy_px[:, :2] + own.boxes_xyxy_px[:, 2:]).astype(np.float64) / 2
         for row, own_id in enumerate(own.ids.tolist()):
-            entity = self._by_own.get(own_id)  # a step that comes late finds tracks merged away since
+            entity = by_own.get(own_id)  # a step that comes late finds tracks merged away since
             if entity is not None:
                 entity.own_then = (centres[row], frame_index)
 
@@ -344,10 +335,6 @@ class Fusion:
         # One entity of two; the one with the older id stays.
         if ours.id and theirs.id:
             self._merged.append((min(ours.id, theirs.id), max(ours.id, theirs.id)))
-        if theirs.own_id is not None:  # a track of ours that was lost
-            self._by_own.pop(theirs.own_id, None)
-        if ours.edge_id is not None:  # one of the edge's that is over
-            self._by_edge.pop(ours.edge_id, None)
         survivor, merged = (
             (theirs, ours) if theirs.id and (not ours.id or theirs.id < ours.id) else (ours, theirs)
         )
@@ -359,22 +346,12 @@ class Fusion:
         survivor.edge_id, survivor.edge_vote = theirs.edge_id, theirs.edge_vote
         survivor.reported, survivor.missed, survivor.apart = theirs.reported, theirs.missed, 0
         survivor.unlisted, survivor.is_doubted = 0, False
-        if survivor.own_id is not None:
-            self._by_own[survivor.own_id] = survivor
-        if survivor.edge_id is not None:
-            self._by_edge[survivor.edge_id] = survivor
         self._entities.remove(merged)
 
     def _forget_old(self, frame_index: int) -> None:
-        old = [one for one in self._entities if frame_index - one.last_frame > self._forget]
-        if len(self._entities) - len(old) > MAX_ENTITIES:
-            old = sorted(self._entities, key=lambda one: one.last_frame)[:-MAX_ENTITIES]
-        if not old:
-            return
-        merged = set(map(id, old))
-        self._entities = [one for one in self._entities if id(one) not in merged]
-        self._by_own = {key: one for key, one in self._by_own.items() if id(one) not in merged}
-        self._by_edge = {key: one for key, one in self._by_edge.items() if id(one) not in merged}
+        self._entities = [one for one in self._entities if frame_index - one.last_frame <= self._forget]
+        for old in sorted(self._entities, key=lambda one: one.last_frame)[:-MAX_ENTITIES]:
+            self._entities.remove(old)
 
     def _is_edge_only(self, entity: Entity, frame_index: int) -> bool:
         return entity.is_report_live(frame_index, patience=self._rules.patience)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,72 +22,43 @@ _FEATHER_PX = 1.5
 """Width of the seam in pixels of the result. A detector takes a hard edge for a contour."""
 
 
-@dataclass(frozen=True, slots=True)
-class Patch:
-    """A still on the pixel grid of the result."""
-
-    left: int
-    top: int
-    image_bgr: Image
-    opacity: npt.NDArray[np.float32]
-    """(height, width) 0…1: the share of each pixel that the still covers, soft at the seam."""
-
-
 def composite(base_bgr: Image, stills: Sequence[DecodedStill], *, view: View, zoom: float = 1.0) -> Image:
     """The base picture with each still in its place, ``zoom`` times as large as the base; a copy.
 
-    Later stills lie over earlier ones.
+    Later stills lie over earlier ones. Cubic where it is enlarged, area means where it is shrunk.
     """
-    picture = _enlarged(base_bgr, zoom)
+    if zoom == 1:
+        picture = base_bgr.copy()
+    else:
+        height, width = base_bgr.shape[:2]
+        size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
+        picture = resampled(base_bgr, (0.0, 0.0), (1 / zoom, 1 / zoom), size)
     for still in stills:
-        patch = patch_of(still, view=view, zoom=zoom, size=(picture.shape[1], picture.shape[0]))
-        if patch is not None:
-            _paste(picture, patch)
+        _paste(picture, still, view, zoom)
     return picture
 
 
-def patch_of(still: DecodedStill, *, view: View, zoom: float, size: tuple[int, int]) -> Patch | None:
-    """The still resampled to the pixels of a result of ``size`` that it touches; None where it touches none.
-
-    Cubic where it is enlarged, area means where it is shrunk.
-    """
-    x1, y1, x2, y2 = _place(still.crop_source_px, view, zoom)
+def _paste(picture: Image, still: DecodedStill, view: View, zoom: float) -> None:
+    offset = view.offset_px * 2
+    x1, y1, x2, y2 = (
+        (edge * view.scale + offset[axis]) * zoom for axis, edge in enumerate(still.crop_source_px)
+    )
     left, top = max(0, math.floor(x1)), max(0, math.floor(y1))
-    right, bottom = min(size[0], math.ceil(x2)), min(size[1], math.ceil(y2))
+    right, bottom = min(picture.shape[1], math.ceil(x2)), min(picture.shape[0], math.ceil(y2))
     if right <= left or bottom <= top:
-        return None
+        return
     still_height, still_width = still.image_bgr.shape[:2]
     step_x, step_y = still_width / (x2 - x1), still_height / (y2 - y1)
     origin = ((left - x1) * step_x, (top - y1) * step_y)
     image = resampled(still.image_bgr, origin, (step_x, step_y), (right - left, bottom - top))
     across = _coverage(np.arange(left, right) + 0.5, x1, x2)
     down = _coverage(np.arange(top, bottom) + 0.5, y1, y2)
-    return Patch(left, top, image, np.outer(down, across).astype(np.float32))
-
-
-def _place(crop_source_px: tuple[int, int, int, int], view: View, zoom: float) -> list[float]:
-    # Where a crop lies in the result: x1 y1 x2 y2, double precision.
-    offset = view.offset_px * 2
-    return [(edge * view.scale + offset[axis]) * zoom for axis, edge in enumerate(crop_source_px)]
-
-
-def _enlarged(base_bgr: Image, zoom: float) -> Image:
-    if zoom == 1:
-        return base_bgr.copy()
-    height, width = base_bgr.shape[:2]
-    size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
-    return resampled(base_bgr, (0.0, 0.0), (1 / zoom, 1 / zoom), size)
+    opacity = np.outer(down, across).astype(np.float32)[..., None]
+    place = picture[top:bottom, left:right]
+    np.copyto(place, np.rint(place * (1 - opacity) + image * opacity).astype(np.uint8))
 
 
 def _coverage(centres: npt.NDArray[np.floating[Any]], first: float, last: float) -> npt.NDArray[np.float64]:
     # How much each pixel of a line shows of the interval ``first``…``last``, rising over the feather.
     depth = np.minimum(centres - first, last - centres) + 0.5
     return np.asarray(np.clip(depth / _FEATHER_PX, 0, 1), np.float64)
-
-
-def _paste(picture: Image, patch: Patch) -> None:
-    height, width = patch.opacity.shape
-    place = picture[patch.top : patch.top + height, patch.left : patch.left + width]
-    opacity = patch.opacity[..., None]
-    mixed = place * (1 - opacity) + patch.image_bgr * opacity
-    np.copyto(place, np.rint(mixed).astype(np.uint8))

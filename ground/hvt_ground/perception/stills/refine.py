@@ -13,7 +13,7 @@ only clock here.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -106,9 +106,25 @@ class Refiner:
         by_frame: dict[int, list[StillSeen]] = {}
         for still, _ in self._held.values():
             by_frame.setdefault(still.event.shown_at[0], []).append(still)
+        newest = history.newest_tracked
         resolved: list[StillSeen] = []
         for frame_index in sorted(by_frame):
-            resolved += self._resolve_frame(by_frame[frame_index], history, now_frame, known_as)
+            held, tracks = by_frame[frame_index], history.tracks(frame_index)
+            if tracks is None:
+                gone = self._gone(frame_index, history)
+                for still in held:
+                    if gone or now_frame > self._held[still.key][1]:
+                        named = self._by_name(still, history, known_as) if still.event.stored else None
+                        resolved.append(named or self._unmatched(still, gone or "late"))
+                continue
+            found = self._match(held, tracks, history)
+            confirmed = newest is not None and newest >= frame_index + self._confirm_frames
+            for still in sorted(held, key=lambda still: still.key):
+                match = found[still.key]
+                if not isinstance(match, str):
+                    resolved.append(self._apply(still, *match))
+                elif confirmed or now_frame > self._held[still.key][1]:
+                    resolved.append(self._unmatched(still, match))
         for done in resolved:
             del self._held[done.key]
         return resolved
@@ -175,49 +191,13 @@ class Refiner:
 
     # One frame's stills.
 
-    def _resolve_frame(
-        self, held: list[StillSeen], history: History, now_frame: int, known_as: Callable[[int], int | None]
-    ) -> list[StillSeen]:
-        frame_index = held[0].event.shown_at[0]
-        tracks = history.tracks(frame_index)
-        if tracks is None:
-            return self._resolve_untracked(held, history, now_frame, known_as)
-        found = self._match(held, tracks, history)
-        newest = history.newest_tracked
-        resolved: list[StillSeen] = []
-        for still in sorted(held, key=lambda still: still.key):
-            match = found[still.key]
-            if not isinstance(match, str):
-                resolved.append(self._apply(still, *match))
-            elif now_frame > self._held[still.key][1] or (
-                newest is not None and newest >= frame_index + self._confirm_frames
-            ):
-                resolved.append(self._unmatched(still, match))
-        return resolved
-
-    def _resolve_untracked(
-        self,
-        held: Iterable[StillSeen],
-        history: History,
-        now_frame: int,
-        known_as: Callable[[int], int | None],
-    ) -> list[StillSeen]:
+    @staticmethod
+    def _gone(frame_index: int, history: History) -> Outcome | None:
         # Tracks come in the order of frames: once a later frame is there, an absent one never will be.
-        resolved: list[StillSeen] = []
         oldest, newest = history.oldest_tracked, history.newest_tracked
-        for still in held:
-            frame_index = still.event.shown_at[0]
-            outcome: Outcome | None = None
-            if oldest is not None and frame_index < oldest:
-                outcome = "late"
-            elif newest is not None and frame_index < newest:
-                outcome = "frame lost"
-            elif now_frame > self._held[still.key][1]:
-                outcome = "late"
-            if outcome is not None:
-                named = self._by_name(still, history, known_as) if still.event.stored else None
-                resolved.append(named or self._unmatched(still, outcome))
-        return resolved
+        if oldest is None or newest is None or frame_index > newest:
+            return None
+        return "late" if frame_index < oldest else "frame lost"
 
     def _by_name(
         self, still: StillSeen, history: History, known_as: Callable[[int], int | None]
@@ -234,10 +214,9 @@ class Refiner:
         return self._apply(still, tracks, int(np.flatnonzero(tracks.ids == track_id)[0]))
 
     def _match(
-        self, held: list[StillSeen], tracks: Tracks, history: History
+        self, held: Sequence[StillSeen], tracks: Tracks, history: History
     ) -> dict[tuple[int, int], TrackMatch]:
-        newest = history.newest_tracked or 0
-        last = min(tracks.frame_index + self._confirm_frames, newest)
+        last = min(tracks.frame_index + self._confirm_frames, history.newest_tracked or 0)
         later = (history.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
         return self._matcher.match(
             held, tracks, later=(t for t in later if t is not None), class_names=self._vocabulary.names
@@ -266,10 +245,6 @@ class Refiner:
         after = self._read(class_posterior, tracks, row)
         self.class_changes += after.class_id != before.class_id
         names = self._vocabulary.names
-        of_names = ((names[one.class_id], one.sure) for one in (before, after))
-        is_before_vague, is_after_vague = (
-            self.tilt.is_vague(name, known=known or name == "car") for name, known in of_names
-        )
         event = replace(
             still.event,
             track_id=track_id,
@@ -278,8 +253,8 @@ class Refiner:
             confidence=after.confidence,
             doubted=self._is_doubted(after, names[tracks.class_ids[row]]),
             sure=self._is_sure(after),
-            vague=(is_before_vague, is_after_vague),
         )
+        event = replace(event, vague=self.tilt.vague_of(event, sure=(before.sure, after.sure)))
         outcome: Outcome = "matched" if newest or self._mode == "fuse" else "superseded"
         return replace(still, event=event, outcome=outcome)
 
@@ -387,8 +362,11 @@ class ViewTilt:
         apart = are_apart(still.class_before, still.class_after) and not known
         return is_nothing(still.class_after) or apart
 
-    def vague_of(self, still: Refinement) -> tuple[bool, bool]:
-        """`Refinement.vague` of a still of no track, which speaks for itself."""
-        sides = (still.class_before, False), (still.class_after, still.confidence > SURE)
-        before, after = (self.is_vague(name, known=sure or name == "car") for name, sure in sides)
-        return before, after
+    def vague_of(self, still: Refinement, *, sure: tuple[bool, bool] | None = None) -> tuple[bool, bool]:
+        """`Refinement.vague`; by default of a still of no track, which speaks for itself."""
+        was_known, known = (False, still.confidence > SURE) if sure is None else sure
+        before, after = still.class_before, still.class_after
+        return (
+            self.is_vague(before, known=was_known or before == "car"),
+            self.is_vague(after, known=known or after == "car"),
+        )

@@ -97,29 +97,42 @@ class Says:
         return detections(boxes, confidences, classes)
 
 
-def test_all_stills_of_a_frame_are_one_run():
-    """Four stills a frame would cost the ground four networks' time."""
+STILL = decoded((400, 200, 480, 280))
+
+
+def test_all_stills_of_a_frame_are_one_run_and_without_its_picture_none():
+    """Four stills would cost four networks' time; one whose frame was lost be named by another moment's picture."""
     detector = Says(((100, 50, 120, 70), 0.6, 0))
-    stills = [decoded((400, 200, 480, 280)), decoded((40, 40, 120, 120))]
-    Redetection(detector, view=VIEW).read(stills, GREY)
-    assert len(detector.seen) == 1
-    assert detector.seen[0][60, 110].tolist() == detector.seen[0][20, 20].tolist() == [0, 0, 255]
-    assert Redetection(detector, view=VIEW).read([], GREY).objects == ()
-    assert len(detector.seen) == 1
+    reader = Redetection(detector, view=VIEW)
+    assert reader.read([], GREY).objects == ()
+    read = reader.read([STILL], None)
+    assert (read.objects, len(read.found), detector.seen) == (((ObjectReading(),),), 0, [])
+    reader.read([STILL, decoded((40, 40, 120, 120))], GREY)
+    (picture,) = detector.seen
+    assert picture[60, 110].tolist() == picture[20, 20].tolist() == [0, 0, 255]
 
 
-def test_a_second_opinion_at_the_same_place_counts():
-    """A van that is nearly a car would be told to the policy as certain, or as any of ten classes."""
-    detector = Says(((101, 50, 121, 70), 0.4, 0), ((100, 50, 120, 70), 0.5, 2), ((100, 50, 120, 60), 0.9, 1))
-    ((reading,),) = Redetection(detector, view=VIEW).read([decoded((400, 200, 480, 280))], GREY).objects
-    # The bus covers half of the place only: it casts doubt, and does not name the object.
-    assert reading.posterior.class_name == "van"
-    assert reading.box_base_px == (100, 50, 120, 70)
-    np.testing.assert_allclose(reading.posterior.probabilities, np.array([0.4, 0.5, 0.5]) / 1.4, atol=1e-6)
-    detector.rows = detector.rows[:2]
-    ((reading,),) = Redetection(detector, view=VIEW).read([decoded((400, 200, 480, 280))], GREY).objects
-    assert (reading.posterior.class_name, reading.posterior.confidence) == ("van", pytest.approx(0.5))
-    np.testing.assert_allclose(reading.posterior.probabilities, [0.4, 0.1, 0.5], atol=1e-6)
+@pytest.mark.parametrize(
+    ("found", "probabilities"),
+    [
+        # A van that is nearly a car would be told to the policy as certain, or as any of ten classes. The bus covers
+        # half of the place only: it casts doubt, and does not name the object.
+        (
+            [((101, 50, 121, 70), 0.4, 0), ((100, 50, 120, 70), 0.5, 2), ((100, 50, 120, 60), 0.9, 1)],
+            (4, 5, 5),
+        ),
+        ([((101, 50, 121, 70), 0.4, 0), ((100, 50, 120, 70), 0.5, 2)], (4, 1, 5)),
+        ([((100, 50, 120, 70), 1.0, 2)], (0, 0, 1)),  # a logarithm of nothing would end the ground
+    ],
+)
+def test_a_second_opinion_at_the_same_place_counts(found, probabilities):
+    """See each case."""
+    ((reading,),) = Redetection(Says(*found), view=VIEW).read([STILL], GREY).objects
+    expected = np.array(probabilities) / sum(probabilities)
+    assert (reading.posterior.class_name, reading.box_base_px) == ("van", (100, 50, 120, 70))
+    assert reading.posterior.confidence == pytest.approx(expected[2])
+    np.testing.assert_allclose(reading.posterior.probabilities, expected, atol=1e-6)
+    assert (reading.posterior.entropy_nats == 0) == (probabilities == (0, 0, 1))
 
 
 def test_a_detection_speaks_for_one_object_only():
@@ -127,8 +140,7 @@ def test_a_detection_speaks_for_one_object_only():
     near, behind = (100.0, 50.0, 120.0, 70.0), (108.0, 50.0, 128.0, 70.0)
     still = dataclasses.replace(decoded((400, 200, 520, 280)), boxes_base_px=(near, behind))
     ((lead, also),) = Redetection(Says((near, 0.6, 0)), view=VIEW).read([still], GREY).objects
-    assert lead.posterior.class_name == "car"
-    assert also == ObjectReading()
+    assert (lead.posterior.class_name, also) == ("car", ObjectReading())
 
 
 def test_what_nobody_named_inside_a_still_is_found():
@@ -144,8 +156,7 @@ def test_what_nobody_named_inside_a_still_is_found():
     )
     still = dataclasses.replace(decoded((396, 196, 516, 284)), boxes_base_px=(named,))
     found = Redetection(detector, view=VIEW).read([still], GREY).found
-    assert found.boxes_xyxy_px.tolist() == [[121, 51, 127, 60]]
-    assert found.class_ids.tolist() == [2]
+    assert (found.boxes_xyxy_px.tolist(), found.class_ids.tolist()) == ([[121, 51, 127, 60]], [2])
     assert found.confidences.tolist() == [pytest.approx(0.7)]
     keen = Redetection(detector, view=VIEW, new_confidence=0.2).read([still], GREY).found
     assert len(keen) == 2
@@ -186,62 +197,27 @@ def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch
     )
 
 
-def test_redetection_without_the_picture_says_nothing():
-    """A still whose frame was lost would be named by a picture of another moment."""
-    reader = Redetection(Bright(), view=VIEW)
-    read = reader.read([decoded((400, 200, 480, 280))], None)
-    assert read.objects == ((ObjectReading(),),)
-    assert len(read.found) == 0
-    assert reader.class_names == ("car", "bus", "van")
-
-
-def test_a_certain_detector_has_no_entropy():
-    """A logarithm of nothing would end the ground."""
-
-    class Sure(Bright):
-        class_names = ("car",)
-
-        def detect(self, image_bgr):
-            found = super().detect(image_bgr)
-            return Detections(
-                found.boxes_xyxy_px, np.ones_like(found.confidences), np.zeros_like(found.class_ids)
-            )
-
-    ((reading,),) = Redetection(Sure(), view=VIEW).read([decoded((400, 200, 480, 280))], GREY).objects
-    answer = reading.posterior
-    assert (answer.class_name, answer.entropy_nats) == ("car", 0.0)
-    assert answer.probabilities.tolist() == [1.0]
-
-
-def test_the_crop_reader_gives_the_classifiers_answers_in_order(tmp_path):
-    """Two objects of one frame would swap their classes."""
+@pytest.fixture
+def reader(tmp_path) -> CropReader:
+    """Of colours."""
     names = tmp_path / "names.txt"
     names.write_text("red\ngreen\nblue\n")
     model = colour_classifier(tmp_path / "colour.onnx")
-    reader = CropReader(open_classifier(str(model), labels=names), view=VIEW)
+    return CropReader(open_classifier(str(model), labels=names), view=VIEW)
+
+
+def test_the_crop_reader_gives_the_classifiers_answers_in_order(reader):
+    """Two objects of one frame would swap their classes, or a van and the car beside it in one still share one."""
     stills = [decoded((0, 0, 40, 40), colour=colour) for colour in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
-    read = reader.read(stills, None)
-    assert [one.posterior.class_name for (one,) in read.objects] == ["blue", "green", "red"]
-    assert reader.class_names == ("red", "green", "blue")
-
-
-def test_the_crop_reader_shows_each_object_of_a_shared_still_by_itself(tmp_path):
-    """A van and the car beside it would share one class."""
-    names = tmp_path / "names.txt"
-    names.write_text("red\ngreen\nblue\n")
-    reader = CropReader(
-        open_classifier(str(colour_classifier(tmp_path / "colour.onnx")), labels=names), view=VIEW
-    )
     image = np.zeros((50, 100, 3), np.uint8)  # coded at half the size of its crop
     image[:, :50], image[:, 50:] = (0, 0, 255), (255, 0, 0)
-    still = DecodedStill(
-        image, (400, 200, 600, 300), ((102.0, 52.0, 123.0, 73.0), (127.0, 52.0, 148.0, 73.0)), 0
-    )
-    ((lead, also),) = reader.read([still], None).objects
-    assert (lead.posterior.class_name, also.posterior.class_name) == ("red", "blue")
-    first, second = object_crops(still, view=VIEW)
-    assert first.shape[:2] == (50, 53)
-    assert second.shape[:2] == (50, 53)
+    boxes = ((102.0, 52.0, 123.0, 73.0), (127.0, 52.0, 148.0, 73.0))
+    shared = DecodedStill(image, (400, 200, 600, 300), boxes, 0)
+    read = reader.read([*stills, shared], None)
+    said = [[one.posterior.class_name for one in objects] for objects in read.objects]
+    assert said == [["blue"], ["green"], ["red"], ["red", "blue"]]
+    assert reader.class_names == ("red", "green", "blue")
+    assert [one.shape[:2] for one in object_crops(shared, view=VIEW)] == [(50, 53)] * 2
 
 
 @given(st.lists(st.tuples(*[st.floats(-50, 400, width=32)] * 4), min_size=1, max_size=3))
@@ -249,15 +225,11 @@ def test_no_box_of_a_still_is_too_odd_to_cut(corners):
     """A header with a box outside its crop would end the ground."""
     boxes = [(min(a, c), min(b, d), max(a, c), max(b, d)) for a, b, c, d in corners]
     still = DecodedStill(np.zeros((40, 60, 3), np.uint8), (400, 200, 460, 240), tuple(boxes), 0)
-    for crop in object_crops(still, view=VIEW):
-        assert crop.shape[0] >= 1
-        assert crop.shape[1] >= 1
+    assert all(min(crop.shape) >= 1 for crop in object_crops(still, view=VIEW))
 
 
 def test_without_any_model_stills_have_no_name():
     """A ground without models would not start."""
     both = dataclasses.replace(decoded((0, 0, 9, 9)), boxes_base_px=((0.0, 0.0, 1.0, 1.0),) * 2)
-    assert NoReader().read([decoded((0, 0, 9, 9)), both], GREY).objects == (
-        (ObjectReading(),),
-        (ObjectReading(), ObjectReading()),
-    )
+    silent = ObjectReading()
+    assert NoReader().read([decoded((0, 0, 9, 9)), both], GREY).objects == ((silent,), (silent, silent))

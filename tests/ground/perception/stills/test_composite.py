@@ -42,9 +42,8 @@ def test_the_still_takes_its_place_at_base_resolution():
     picture = composite(GREY, [one_colour((400, 200, 480, 280))], view=VIEW)
     assert picture.shape == GREY.shape
     assert (picture[52:68, 102:118] == (0, 0, 255)).all()
-    outside = picture.copy()
-    outside[50:70, 100:120] = 100
-    assert (outside == 100).all()
+    picture[50:70, 100:120] = 100
+    assert (picture == 100).all()
     assert (GREY == 100).all(), "the decoded picture is left alone"
 
 
@@ -53,9 +52,7 @@ def test_the_seam_is_soft():
     picture = composite(GREY, [one_colour((400, 200, 480, 280), colour=(200, 200, 200))], view=VIEW)
     across = picture[60, 98:104, 0].tolist()
     assert across == sorted(across)
-    assert across[1] == 100
-    assert 110 < across[2] < 190
-    assert across[-1] == 200
+    assert (across[1], 110 < across[2] < 190, across[-1]) == (100, True, 200)
 
 
 @pytest.mark.parametrize("zoom", [1.0, 2.0, 1.7])
@@ -105,12 +102,10 @@ def test_stills_at_the_border_and_shrunk_stills_fit():
         one_colour((300, 300, 302, 301)),  # less than a pixel of the base
     ]
     picture = composite(GREY, stills, view=VIEW)
-    assert picture[3, 3].tolist() == [0, 0, 255]
-    assert picture[-3, -3].tolist() == [0, 255, 0]
-    assert picture[90, 230].tolist() == [0, 0, 255]
+    assert picture[[3, -3, 90], [3, -3, 230]].tolist() == [[0, 0, 255], [0, 255, 0], [0, 0, 255]]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(
     st.tuples(st.integers(0, 1279), st.integers(0, 719), st.integers(1, 700), st.integers(1, 700)),
     st.sampled_from(["letterbox", "crop"]),
@@ -125,5 +120,4 @@ def test_any_crop_of_any_view_can_be_pasted(box, fit, base, zoom):
     picture = np.full((base[1], base[0], 3), 100, np.uint8)
     pasted = composite(picture, [one_colour(crop, colour=(200, 200, 200))], view=view, zoom=zoom)
     assert pasted.shape == (round(base[1] * zoom), round(base[0] * zoom), 3)
-    assert pasted.min() >= 100
-    assert pasted.max() <= 200
+    assert 100 <= pasted.min() <= pasted.max() <= 200
