@@ -6,8 +6,9 @@ import queue
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,19 @@ class _Watcher:
         while (state := self._states.get()) is not None:
             with turns:
                 self._failures.attempt(part, self._service.show, None, state)
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """All that outlives a link."""
+
+    models: Models
+    factory: SessionFactory
+    services: Sequence[Service]
+    watchers: Sequence[_Watcher]
+    line: StatusLine
+    page: str
+    """The address of the viewer."""
 
 
 class Ground:
@@ -171,7 +185,7 @@ class Ground:
             session = links.enter_context(self._open_link(models))
             make_folders(config)
             set_aside(config)
-            client = EdgeClient.of_session(session, config.link)
+            client = EdgeClient(session, config.link)
             for one in services:
                 one.begin(client)
             factory = SessionFactory(
@@ -184,10 +198,9 @@ class Ground:
                 program=self._program,
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
-            page = "" if view is None else view.page
-            serve = partial(self._serve_link, models=models, services=services, watchers=watchers, view=page)
+            parts = _Parts(models, factory, services, watchers, line, "" if view is None else view.page)
             try:
-                while serve(session, factory, line):
+                while self._serve_link(session, parts):
                     links.close()
                     self._anew, self._began_s = True, time.monotonic()
                     session = links.enter_context(self._open_link(models))
@@ -203,26 +216,16 @@ class Ground:
         self._deaf.clear()
         return open_session(self._config.link, failures=models.failures, on_deaf=self._deaf.set)
 
-    def _serve_link(
-        self,
-        session: zenoh.Session,
-        factory: SessionFactory,
-        line: StatusLine,
-        *,
-        models: Models,
-        services: Sequence[Service],
-        watchers: Sequence[_Watcher],
-        view: str,
-    ) -> bool:
-        # Serve its edges; returns whether to go on with another session. ``view`` is the address of the viewer.
+    def _serve_link(self, session: zenoh.Session, parts: _Parts) -> bool:
+        # Serve its edges; returns whether to go on with another session.
         config = self._config
         with ExitStack() as stack:
             group = None
             if config.group is not None:
-                shown = next((one.shown_to_others for one in services if one.shown_to_others), "")
+                shown = next((one.shown_to_others for one in parts.services if one.shown_to_others), "")
                 group = stack.enter_context(GroundGroup(session, config.group, page=shown))
-            attempt = models.failures.attempt
-            logs = ((part_of(one), one.message_log) for one in services if one.message_log is not None)
+            attempt = parts.models.failures.attempt
+            logs = ((part_of(one), one.message_log) for one in parts.services if one.message_log is not None)
             log = next((partial(attempt, part, log, None) for part, log in logs), None)
             link = stack.enter_context(
                 GroundLink(
@@ -238,17 +241,12 @@ class Ground:
             self._on_started()
             self._begun = True
             notify_systemd("READY=1")
-            self._say_where(
-                line,
-                view=view,
-                pages=[link for one in services for link in one.links],
-                late={one.part for one in models.failures.now},
-            )
+            self._say_where(parts)
             try:
-                self._serve(link, factory, line, watch, models, watchers, group)
+                self._serve(link, parts, watch, group)
                 again = self._deaf.is_set() and not self._stop.is_set()
                 if not again:
-                    models.give_up()
+                    parts.models.give_up()
             finally:
                 self._close_edges()
             self._raise_error()
@@ -261,29 +259,21 @@ class Ground:
             for content, sinks in self._ended[edge]
         ]
 
-    def _say_where(self, line: StatusLine, *, view: str, pages: Sequence[str], late: Collection[str]) -> None:
-        config = self._config
+    def _say_where(self, parts: _Parts) -> None:
+        config, note = self._config, parts.line.note
+        late = {one.part for one in parts.models.failures.now}
         if config.connect:
-            line.note(f"hvt-ground: connecting to {', '.join(config.connect)}")
+            note(f"hvt-ground: connecting to {', '.join(config.connect)}")
         if config.listen or not (config.connect or config.zenoh_config):
             yet = "not yet " * ("listener" in late)
-            line.note(f"hvt-ground: {yet}listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
-        for page in filter(None, (view, *pages)):
+            note(f"hvt-ground: {yet}listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
+        for page in filter(None, (parts.page, *(link for one in parts.services for link in one.links))):
             # Another program may answer there.
-            yet = "not yet, " * (page != view and "web page" in late)
-            line.note(f"hvt-ground: {yet}watch at {page}")
+            yet = "not yet, " * (page != parts.page and "web page" in late)
+            note(f"hvt-ground: {yet}watch at {page}")
 
-    def _serve(
-        self,
-        link: GroundLink,
-        factory: SessionFactory,
-        line: StatusLine,
-        watch: LinkWatch,
-        models: Models,
-        watchers: Sequence[_Watcher],
-        group: GroundGroup | None,
-    ) -> None:
-        config, polls = self._config, 0
+    def _serve(self, link: GroundLink, parts: _Parts, watch: LinkWatch, group: GroundGroup | None) -> None:
+        config, models, line, polls = self._config, parts.models, parts.line, 0
         maker = StateMaker(
             self._clock,
             detector=Path(config.detector).name,
@@ -291,7 +281,7 @@ class Ground:
             calibrated=models.facts.stills_calibrated,
             failures=models.failures,
             loading=lambda: models.loading,
-            recorded=factory.records,
+            recorded=parts.factory.records,
             group=group,
         )
         while not self._stop.wait(_POLL_S):
@@ -301,7 +291,7 @@ class Ground:
             self._leave_edges(ports, link)
             for port in ports:
                 if port.edge not in self._edges:
-                    self._edges[port.edge] = self._serve_edge(port, factory)
+                    self._edges[port.edge] = self._serve_edge(port, parts.factory)
                     self._say_rights(port, line, watch)
             if models.error is not None:
                 raise models.error
@@ -313,7 +303,7 @@ class Ground:
                 if self._anew and "listener" in failed:
                     self._began_s = time.monotonic()  # nobody can come back yet
                 self._state = maker.make(sorted(self._edges.items()))
-                for one in watchers:
+                for one in parts.watchers:
                     one.show(self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
             if self._deaf.is_set() or (config.once and self._all_ended(loading=models.loading)):

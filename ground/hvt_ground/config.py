@@ -148,14 +148,8 @@ class GroundConfig:
 
     @property
     def written(self) -> list[Written]:
-        given = (
-            *(("--record", self.record, ".rrd"), ("--tracks", self.tracks, ".csv")),
-            *(
-                ("--stills", self.stills, ".csv"),
-                ("--timing", self.timing, ""),
-                ("--summary", self.summary, ""),
-            ),
-        )
+        suffixes = {"record": ".rrd", "tracks": ".csv", "stills": ".csv", "timing": "", "summary": ""}
+        given = ((f"--{name}", getattr(self, name), suffix) for name, suffix in suffixes.items())
         return [(name, path, suffix) for name, path, suffix in given if path is not None]
 
     @property

@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -107,8 +107,8 @@ def check_suffix(path: Path) -> None:
 class Requester:
     """The rights in our own file."""
 
-    file: Path | None = None
-    rights: Rights = field(default_factory=Rights)
+    file: Path | None
+    rights: Rights
 
     @classmethod
     def of(cls, settings: LinkSettings) -> Requester:
@@ -149,11 +149,11 @@ class RemoteEdge:
     where it says no.
     """
 
-    def __init__(self, session: zenoh.Session, edge: str, *, requester: Requester | None = None) -> None:
+    def __init__(self, session: zenoh.Session, edge: str, *, requester: Requester) -> None:
         self.name = edge
         self._session = session
         self._keys = EdgeKeys(edge)
-        self._requester = requester or Requester()
+        self._requester = requester
 
     def info(self) -> Info:
         answer = self._query(Channel.INFO, b"")
@@ -167,12 +167,10 @@ class RemoteEdge:
         answer = self.command(Command.TRACKS)
         if answer.note:
             on_note(answer.note)
+        name = dict(enumerate(names))
         return [
             EdgeTrack(
-                one.track_id,
-                names[one.class_id] if one.class_id < len(names) else str(one.class_id),
-                one.confidence,
-                one.box_source_px,
+                one.track_id, name.get(one.class_id, str(one.class_id)), one.confidence, one.box_source_px
             )
             for one in answer.tracks
         ]
@@ -257,16 +255,15 @@ class RemoteEdge:
         query_s, noted = time.monotonic() + _OUTCOME_S, ""
         while (now_s := time.monotonic()) < until_s:
             item = inbox.get(timeout_s=min(_POLL_S, until_s - now_s))
-            if item is not None and _has_ended(item, answer):
-                raise UserError(f"{self.name} has ended: the still does not come")
-            header = None if item is None else _header(item)
-            answers = None if header is None else (header.session_id, header.parameters.get("ask"))
-            if (
-                header is not None
-                and item is not None
-                and answers == (answer.session_id, answer.still_request)
-            ):
-                return header, item
+            if item is not None and item.key.endswith(f"/{Channel.STATUS}"):
+                status = _read(Status.parse, item.payload)
+                if status and (status.session_id, status.state) == (answer.session_id, "ended"):
+                    raise UserError(f"{self.name} has ended: the still does not come")
+            elif item is not None:
+                header = _read(RoiHeader.parse, item.attachment, item.payload)
+                answers = header and (header.session_id, header.parameters.get("ask"))
+                if header and answers == (answer.session_id, answer.still_request):
+                    return header, item
             if now_s >= query_s:
                 note = self._note_of(answer.still_request)
                 if note and note != noted:
@@ -336,10 +333,11 @@ class EdgeClient:
     """The edges that can be reached from one place; a context manager. ``client["uav-1"]`` is one of them."""
 
     def __init__(
-        self, session: zenoh.Session, *, requester: Requester | None = None, stack: ExitStack | None = None
+        self, session: zenoh.Session, settings: LinkSettings, *, stack: ExitStack | None = None
     ) -> None:
+        """Ask through a session that is open, which its owner closes; ``settings`` are those that it has."""
         self._session = session
-        self._requester = requester
+        self._requester = Requester.of(settings)
         self._stack = stack or ExitStack()
 
     @classmethod
@@ -350,12 +348,7 @@ class EdgeClient:
         """
         stack = ExitStack()
         settings = LinkSettings(role="client", connect=endpoints, zenoh_config=zenoh_config)
-        return cls(stack.enter_context(open_session(settings)), requester=Requester.of(settings), stack=stack)
-
-    @classmethod
-    def of_session(cls, session: zenoh.Session, settings: LinkSettings) -> EdgeClient:
-        """Ask through a session that is open, which its owner closes."""
-        return cls(session, requester=Requester.of(settings))
+        return cls(stack.enter_context(open_session(settings)), settings, stack=stack)
 
     def go_on(self, session: zenoh.Session) -> None:
         """Ask through another session from now on."""
@@ -383,18 +376,8 @@ class EdgeClient:
         self.close()
 
 
-def _header(item: Received) -> RoiHeader | None:
+def _read(parse: Callable[..., _Answer], *data: bytes) -> _Answer | None:
     try:
-        return RoiHeader.parse(item.attachment, item.payload)
+        return parse(*data)
     except WireError:
         return None
-
-
-def _has_ended(item: Received, answer: ControlAnswer) -> bool:
-    if not item.key.endswith(f"/{Channel.STATUS}"):
-        return False
-    try:
-        status = Status.parse(item.payload)
-    except WireError:
-        return False
-    return status.session_id == answer.session_id and status.state == "ended"

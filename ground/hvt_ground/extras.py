@@ -31,19 +31,14 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
 Options = TypeVar("Options", bound=GroundConfig)
 
 _GROUP = "hvt.ground"
-_BROUGHT_BY = {
-    "cot": "cot",
-    "cot-types": "cot",
-    "mcap": "mcap",
-    "terrain": "terrain",
-    "ts": "ground",
-    "keep": "ground",
-    "keep-video": "ground",
-    "log": "ground",
-    "log-size": "ground",
-    "web": "web",
-    "web-proxy": "web",
+_BRINGS = {
+    "cot": ("cot", "cot-types"),
+    "mcap": ("mcap",),
+    "terrain": ("terrain",),
+    "ground": ("ts", "keep", "keep-video", "log", "log-size"),
+    "web": ("web", "web-proxy"),
 }
+_BROUGHT_BY = {setting: package for package, settings in _BRINGS.items() for setting in settings}
 """Settings of the extras that come with HVT, and the package to install for each."""
 
 _ABSENT = "is of an extra that is not installed: pip install 'hvt[{}]'"

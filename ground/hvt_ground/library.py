@@ -21,7 +21,7 @@ from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig
-from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
 from hvt_ground.extras import checked, config_class
 from hvt_ground.sinks import SinkWriter
 
@@ -150,21 +150,18 @@ class _Queue(SinkWriter[Event]):
         self._info = info
         # Stored units are another stretch of the stream than live ones.
         self._decoders = {stored: BaseDecoder(size=info.base_size) for stored in (False, True)}
-        self._awaits_keyframe = {False: True, True: True}
+        self._awaits_keyframe = {False, True}
 
     def log(self, item: Event) -> None:
-        event: Picture | Overlay | PoseUpdate | Refinement | Traffic | Notice | None = None
-        match item:
-            case VideoSample():
-                event = self._decoded(item)
-            case Overlay() | PoseUpdate() | Refinement() | Traffic() | Notice():
-                event = item
+        if not isinstance(item, FrameEvent):
+            return
+        event = self._decoded(item) if isinstance(item, VideoSample) else item
         if event is not None:
             self._put(Received(self._info.edge, self._info.session_id, event))
 
     def skipped(self, count: int) -> None:
         del count
-        self._awaits_keyframe = {False: True, True: True}
+        self._awaits_keyframe = {False, True}
 
     def _put(self, received: Received) -> None:
         waits = self._info.pace == "lockstep"
@@ -182,6 +179,6 @@ class _Queue(SinkWriter[Event]):
         decoder = self._decoders[sample.stored]
         if sample.keyframe:
             decoder.reset()
-            self._awaits_keyframe[sample.stored] = False
-        image = None if self._awaits_keyframe[sample.stored] else decoder.decode(sample.data)
+            self._awaits_keyframe.discard(sample.stored)
+        image = None if sample.stored in self._awaits_keyframe else decoder.decode(sample.data)
         return None if image is None else Picture(sample.frame_index, sample.capture_ns, image, sample.stored)

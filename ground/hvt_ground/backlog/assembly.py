@@ -150,10 +150,8 @@ class BacklogAssembly:
         """Return and forget up to ``most`` acknowledgements that the edge has not been sent yet, oldest first."""
         taken = [self._unreported.popitem(last=False) for _ in range(min(most, len(self._unreported)))]
         return tuple(
-            AcknowledgedRange(
-                session_id=session_id, kind=kind, number=number, acknowledged_bytes=acknowledged_range
-            )
-            for (session_id, kind, number), acknowledged_range in taken
+            AcknowledgedRange(session_id=session_id, kind=kind, number=number, acknowledged_bytes=count)
+            for (session_id, kind, number), count in taken
         )
 
     def _make_space(self, key: ObjectKey, more_bytes: int) -> bool:
@@ -169,20 +167,16 @@ def backlog_content(key: ObjectKey, data: bytes, *, edge: str) -> BacklogContent
     """Read the bytes of a whole object; raises `WireError` and nothing else, for any bytes whatever."""
     session_id, kind, number = key
     if kind == BacklogKind.INFO:
-        return _info(session_id, data, edge=edge)
+        info = Info.parse(data, versions=READ_VERSIONS)
+        if info.session_id != session_id or info.edge != edge:
+            raise WireError("the facts of a stored session are those of another")
+        return info
     if kind == BacklogKind.STILL:
         return _still(session_id, number, data)
     units = parse_backlog_units(data)
     if units[0].frame_index != number:
         raise WireError(f"stored video {number} begins with frame {units[0].frame_index}")
     return units
-
-
-def _info(session_id: int, data: bytes, *, edge: str) -> Info:
-    info = Info.parse(data, versions=READ_VERSIONS)
-    if info.session_id != session_id or info.edge != edge:
-        raise WireError("the facts of a stored session are those of another")
-    return info
 
 
 def _still(session_id: int, number: int, data: bytes) -> ReceivedStill:

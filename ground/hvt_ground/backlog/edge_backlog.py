@@ -127,13 +127,12 @@ class EdgeBacklog:
             with self._lock:
                 self._assembly.settle(key, usable=False)
             raise
-        is_own = key[0] == own.info.session_id
         if isinstance(content, Info):
             with self._lock:
                 self._infos.put(content.session_id, content)
                 self._assembly.settle(key, usable=True)
             return
-        if is_own:  # it stays open as long as its worker
+        if key[0] == own.info.session_id:  # it stays open as long as its worker
             take: Take = lambda: nullcontext(own if own.able() else None)  # noqa: E731
         else:
             assert self._recordings is not None, "without, no chunk of another session is taken"
@@ -170,9 +169,8 @@ class BacklogRecording:
         """Log the amount received and close the file, without waiting for it."""
         totals = self.backlog.totals
         if totals.first is not None and totals.amount():
-            self.sink.log(
-                Notice(*totals.first, "info", f"{totals.amount()} of this session arrived after it had ended")
-            )
+            text = f"{totals.amount()} of this session arrived after it had ended"
+            self.sink.log(Notice(*totals.first, "info", text))
         self.sink.close()
 
     def _emit(self, event: Event) -> None:

@@ -109,9 +109,8 @@ class GroundGroup:
         key, data = self._keys.member(self.member), page.encode()
         self._answers = session.declare_queryable(key, lambda query: query.reply(key, data))
         self._token = session.liveliness().declare_token(self._keys.member(self.member))
-        self._watch = session.liveliness().declare_subscriber(
-            self._keys.everything, self._on_token, history=True
-        )
+        every = self._keys.everything
+        self._watch = session.liveliness().declare_subscriber(every, self._on_token, history=True)
 
     @property
     def members(self) -> tuple[str, ...]:
@@ -146,21 +145,14 @@ class GroundGroup:
             self._serving.discard(edge)
             return False
         if edge not in self._own:
-            self._own[edge] = (
-                now_s,
-                self._session.liveliness().declare_token(self._keys.claim(self.member, edge)),
-            )
+            claim = self._session.liveliness().declare_token(self._keys.claim(self.member, edge))
+            self._own[edge] = now_s, claim
         waited = not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S
         if waited and edge not in self._serving:
             self._serving.add(edge)
             if edge in self._passed and self._lines.take(round(now_s * SECOND_NS)):
-                owner = owner_of(edge, self.members)
-                _log.warning(
-                    "%s: %s does not claim %s (other --edges or keys?): it is served here",
-                    self.name,
-                    owner,
-                    edge,
-                )
+                said = "%s: %s does not claim %s (other --edges or keys?): it is served here"
+                _log.warning(said, self.name, owner_of(edge, self.members), edge)
         # Once it is served, the claim of a member that is about to give way interrupts nothing.
         return edge in self._serving
 
@@ -230,15 +222,14 @@ class GroundGroup:
         there = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
             self._mine.clear()
-            known = self._members if edge is None else self._claims[edge]
+            known, most = self._members, _MOST_MEMBERS
+            if edge is not None:
+                known, most = self._claims[edge], _MOST_CLAIMS
             if not there:
                 known.discard(member)
                 if edge is None:
                     self._pages.pop(member, None)
-            elif (
-                len(known) < (_MOST_MEMBERS if edge is None else _MOST_CLAIMS)
-                and len(self._claims) <= _MOST_EDGES
-            ):
+            elif len(known) < most and len(self._claims) <= _MOST_EDGES:
                 known.add(member)
             if edge is not None and not known:
                 del self._claims[edge]

@@ -32,7 +32,7 @@ where nothing comes but old numbers that have not been here: somebody else has c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 from hvt_common.protocol.messages import MAX_MISSING_BASE, BaseHeader, Flags
 from hvt_common.runtime.statistics import Newest
@@ -125,8 +125,9 @@ class Repair:
         """About the time between two units."""
         self._newest = (sequence, now_ns)
         """The highest sequence, and when it came."""
-        self._took_ns: tuple[int, int] | None = None
-        """How old a hole is when its unit comes that was sent again, and by how much that differs: of late, mean."""
+        self.mean_ns = self._differs_ns = 0
+        """How old a hole is when its unit comes that was sent again, and by how much that differs: of late, mean; 0
+        before the first."""
         self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
         """Holes without one; the time until which none waits; for how long none will."""
 
@@ -138,9 +139,10 @@ class Repair:
 
     def came_again(self, late_ns: int) -> None:
         """A unit that was sent again fills a hole that waits, and is so old."""
-        mean_ns, differs_ns = self._took_ns or (late_ns, late_ns // 4)
-        differs_ns = (3 * differs_ns + abs(late_ns - mean_ns)) // 4
-        self._took_ns = (7 * mean_ns + late_ns) // 8, differs_ns
+        if not self.mean_ns:
+            self.mean_ns, self._differs_ns = late_ns, late_ns // 4
+        self._differs_ns = (3 * self._differs_ns + abs(late_ns - self.mean_ns)) // 4
+        self.mean_ns = (7 * self.mean_ns + late_ns) // 8
         self._unanswered, self._until_ns, self._pause_ns = 0, 0, _UNANSWERED_NS
 
     def unanswered(self, age_ns: int, now_ns: int) -> None:
@@ -164,17 +166,11 @@ class Repair:
         )
 
     @property
-    def mean_ns(self) -> int:
-        """How long it takes in the mean; 0 before the first."""
-        return 0 if self._took_ns is None else self._took_ns[0]
-
-    @property
     def usual_ns(self) -> int:
         """How long that usually takes: then a keyframe is wanted as well."""
         usual_ns = (self.round_trip_ns or 0) + _SLACK_NS
-        if self._took_ns is not None:
-            mean_ns, differs_ns = self._took_ns
-            usual_ns = mean_ns + max(2 * differs_ns, mean_ns // 8)
+        if self.mean_ns:
+            usual_ns = self.mean_ns + max(2 * self._differs_ns, self.mean_ns // 8)
         return min(RESEND_WAIT_NS, usual_ns)
 
 
@@ -189,12 +185,10 @@ class Reassembler(Generic[T]):
         self.counters = StreamCounters()
         self._session: int | None = None
         self._adopted_ns: int | None = None
-        self._left: Newest[int | None, int] = Newest(
-            _REMEMBERED_SESSIONS
-        )  # session id → the sequence it had reached
-        self._outsiders: Newest[int | None, int] = Newest(
-            _REMEMBERED_SESSIONS
-        )  # session id → when it first came
+        self._left: Newest[int | None, int] = Newest(_REMEMBERED_SESSIONS)
+        """Session id → the sequence it had reached."""
+        self._outsiders: Newest[int | None, int] = Newest(_REMEMBERED_SESSIONS)
+        """Session id → when it first came."""
         self._disowned: Newest[int | None, None] = Newest(_REMEMBERED_SESSIONS)
         self._first = 0
         self._next = 0
@@ -208,9 +202,7 @@ class Reassembler(Generic[T]):
         self._late_ns = 0  # how old a hole ever was when its unit came
         self._taken = 0
         self._quiet_until_ns = 0  # no request goes before
-        self._requested_ns = self._answer_ns = (
-            0  # when the first one of this gap went, and how long answers take
-        )
+        self._requested_ns = self._answer_ns = 0  # when the first of this gap went; how long answers take
         self._requests_in_gap = 0
 
     def accept(self, header: BaseHeader, message: T, *, now_ns: int) -> list[Arrival[T]]:
@@ -220,13 +212,10 @@ class Reassembler(Generic[T]):
             return [self._judged(unit, "foreign")]
         if self._adopted_ns is None or header.session_id != self._session:
             duplicate = self._is_duplicate(header.session_id, now_ns)
-            patience_ns = max(SILENCE_NS, 3 * self.repair.interval_ns)
-            return self._accept_outsider(
-                unit,
-                "foreign",
-                patience_ns=DUPLICATE_SILENCE_NS if duplicate else min(patience_ns, DUPLICATE_SILENCE_NS),
-                duplicate=duplicate,
-            )
+            patience_ns = DUPLICATE_SILENCE_NS
+            if not duplicate:
+                patience_ns = min(patience_ns, max(SILENCE_NS, 3 * self.repair.interval_ns))
+            return self._accept_outsider(unit, "foreign", patience_ns=patience_ns, duplicate=duplicate)
         self._note_late(header, now_ns)
         if self._first <= header.sequence < self._next or header.sequence in self._held:
             if now_ns - self._progress_ns < RESTART_SILENCE_NS or self._has_been(header.sequence):
@@ -301,9 +290,7 @@ class Reassembler(Generic[T]):
     def overdue(self, *, now_ns: int) -> list[Arrival[T]]:
         """Units that need not wait any longer behind a hole: at most `REORDER_UNITS` wait, or `RESEND_UNITS`."""
         released: list[Arrival[T]] = []
-        keyframe = max(
-            (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1
-        )
+        keyframe = max((one for one, unit in self._held.items() if unit.header.keyframe), default=-1)
         while self._held:
             first = min(self._held)
             lost = first - self._next
@@ -311,7 +298,7 @@ class Reassembler(Generic[T]):
                 lost
                 and first > keyframe
                 and len(self._held) <= (RESEND_UNITS if self.missing else REORDER_UNITS)
-                and self._hole_age_ns(now_ns) < self._patience_ns
+                and self._hole_age_ns(now_ns) < (RESEND_WAIT_NS if self.missing else self._reorder_ns)
             ):
                 break
             if lost:
@@ -364,10 +351,6 @@ class Reassembler(Generic[T]):
         return REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
 
     @property
-    def _patience_ns(self) -> int:
-        return RESEND_WAIT_NS if self.missing else self._reorder_ns
-
-    @property
     def _alone_ns(self) -> int:
         # How long a hole waits before a keyframe is wanted: no longer where that is there much sooner.
         slow = 0 < _MUCH_SOONER * self._answer_ns < self.repair.mean_ns
@@ -417,19 +400,14 @@ class Reassembler(Generic[T]):
             self._unshown = True
         if too_soon or not header.keyframe:
             return [self._judged(unit, refusal, duplicate=duplicate and too_soon)]
-        resolved = self._leave()
+        resolved = [self._judged(one, "skip") for _, one in sorted(self._held.items())]
         self._adopt(header, now_ns)
         verdict = self._take(unit)
         return [*resolved, self._judged(unit, verdict, starts_session=True)]
 
-    def _leave(self) -> list[Arrival[T]]:
-        # End the present session, if any; units that waited behind a hole are skipped.
-        resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
+    def _adopt(self, header: BaseHeader, now_ns: int) -> None:
         self._held.clear()
         self._synced = False
-        return resolved
-
-    def _adopt(self, header: BaseHeader, now_ns: int) -> None:
         if self._adopted_ns is not None and header.session_id != self._session:
             self._left[self._session] = self._next
             self._left.move_to_end(self._session)
@@ -441,15 +419,7 @@ class Reassembler(Generic[T]):
         self._first = self._next = header.sequence
         self._last_frame, self._recent = header.frame_index - 1, 0
 
-    def _judged(
-        self,
-        unit: Arrival[T],
-        verdict: Verdict,
-        *,
-        lost_before: int = 0,
-        starts_session: bool = False,
-        duplicate: bool = False,
-    ) -> Arrival[T]:
+    def _judged(self, unit: Arrival[T], verdict: Verdict, **more: Any) -> Arrival[T]:
         self.counters.duplicates += verdict == "duplicate"
         self.counters.replayed += verdict == "stale"
         starts_run = verdict == "decode" and not self._synced
@@ -461,11 +431,4 @@ class Reassembler(Generic[T]):
                 self._answer_ns += more_ns // 4 if more_ns > 0 and self._answer_ns else more_ns
             self._synced = True
             self._requests_in_gap = 0
-        return replace(
-            unit,
-            verdict=verdict,
-            starts_run=starts_run,
-            starts_session=starts_session,
-            lost_before=lost_before,
-            duplicate=duplicate,
-        )
+        return replace(unit, verdict=verdict, starts_run=starts_run, **more)

@@ -134,7 +134,11 @@ class Receiver:
         parsed = parse_key(item.key)
         row = parsed[1] if parsed else None
         try:
-            message = _parsed(row, item, self._versions)
+            kind = _KINDS.get(row) if row else None
+            if kind is None:
+                return []
+            parts = (item.attachment, item.payload) if row in _ATTACHED else (item.payload, b"")
+            message: _Message | None = kind.parse(*parts, versions=self._versions)
             match message:
                 case BaseHeader():
                     self._captures.note(message)
@@ -218,11 +222,3 @@ class Receiver:
             self.unusable += 1
         else:
             self.skip(row, WireError(f"it belongs to the session {session_id:08x}, which is not shown"))
-
-
-def _parsed(row: Channel | None, item: Received, versions: Sequence[int]) -> _Message | None:
-    kind = None if row is None else _KINDS.get(row)
-    if kind is None:
-        return None
-    data, payload = (item.attachment, item.payload) if row in _ATTACHED else (item.payload, b"")
-    return kind.parse(data, payload, versions=versions)

@@ -149,9 +149,8 @@ class Reception:
                 self._base_sequence, self._arrived_ns = header.sequence, at_ns
             self._from_start |= header.sequence == 0
             if self.knows_delay:
-                self._delays_ms.append(
-                    max(0.0, (at_ns - self.capture_clock.to_local_ns(header.capture_ns)) / _MS)
-                )
+                delay_ns = at_ns - self.capture_clock.to_local_ns(header.capture_ns)
+                self._delays_ms.append(max(0.0, delay_ns / _MS))
             self._arrive(item)
 
     def note_held(self, missing: tuple[int, ...], newest: BaseHeader | None, *, at_ns: int) -> bool:
@@ -294,11 +293,8 @@ class Reception:
         self.capture_clock.note(capture_ns, received_ns=received_ns)
         if was_sound and not self.capture_clock.is_sound:
             off_s = abs(received_ns - self.clock_offset.to_local_ns(capture_ns)) // SECOND_NS
-            self._note(
-                "warning",
-                f"the camera's clock is {off_s} s off: ages count from the arrival of pictures, and delays are not "
-                "known",
-            )
+            counts = "ages count from the arrival of pictures, and delays are not known"
+            self._note("warning", f"the camera's clock is {off_s} s off: {counts}")
 
     # Its state
 

@@ -19,7 +19,7 @@ from itertools import chain, count
 from pathlib import Path
 
 from hvt_common.units import SECOND_NS, Limit
-from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, VideoSample
+from hvt_ground.events import Event, FrameEvent, Notice, Overlay, VideoSample
 from hvt_ground.recordings.row import FileAccount, RecordingRow
 from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.queued import SinkWriter
@@ -101,7 +101,7 @@ class SessionFiles(SinkWriter[Event]):
     # Which file
 
     def _go_on(self, item: FrameEvent) -> None:
-        if self._split is None or _stored(item):
+        if self._split is None or getattr(item, "stored", False):
             return
         if self._next is not None:
             behind = item.frame_index - self._starts[-1][0]
@@ -136,7 +136,7 @@ class SessionFiles(SinkWriter[Event]):
 
     def _settle(self, hurry: threading.Event | None) -> None:
         if self._next is not None:
-            former, self._next = self._recorder.file, self._next
+            former = self._recorder.file
             self._recorder.go_on_in(self._next, at=self._starts[-1])
             self._next = None
             self._close(former, hurry)
@@ -149,15 +149,15 @@ class SessionFiles(SinkWriter[Event]):
             return item, self._next or self._recorder.file
         if self._next is not None and part == newest - 1:
             return item, self._recorder.file
-        stored = _stored(item)
+        stored = getattr(item, "stored", False)
         if stored or (isinstance(item, Notice) and part in self._late):
             file = self._late_file(part)
             if file is not None:
                 return item, file
-        if stored:
-            return item, self._next or self._recorder.file
-        frame, capture_ns = self._starts[-1]
-        return replace(item, frame_index=frame, capture_ns=capture_ns), self._next or self._recorder.file
+        if not stored:
+            frame, capture_ns = self._starts[-1]
+            item = replace(item, frame_index=frame, capture_ns=capture_ns)
+        return item, self._next or self._recorder.file
 
     def _late_file(self, part: int) -> RecordingFile | None:
         # The file beside a former one; None where too many were made.
@@ -213,10 +213,6 @@ class SessionFiles(SinkWriter[Event]):
                 whole=file.closed,
             )
         )
-
-
-def _stored(item: FrameEvent) -> bool:
-    return isinstance(item, VideoSample | Overlay | Refinement) and item.stored
 
 
 def _free(paths: Iterable[Path]) -> Path:

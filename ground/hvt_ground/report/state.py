@@ -287,10 +287,7 @@ class StateMaker:
         )
 
     def _edge(self, edge: str, sessions: EdgeSessions, now_ns: int) -> EdgeState:
-        session, silent_ns = (
-            sessions.session,
-            sessions.receiver.silent_ns,
-        )  # it may end in its thread meanwhile
+        session, silent_ns = sessions.session, sessions.receiver.silent_ns  # it may end meanwhile
         link = self._link(edge, sessions, session, now_ns)
         before, since_ns = self._links.get(edge, (None, now_ns))
         if link != before:

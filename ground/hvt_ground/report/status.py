@@ -124,9 +124,7 @@ def completed(
     general = () if failures is None else failures.parts
     failed = [*sessions.failures.parts, *(one for one in general if _concerns(one.part, edge))]
     queued = [sink for sink in sinks if isinstance(sink, QueuedSink)]
-    files = dict.fromkeys(
-        path for sink in queued for path in sink.files
-    )  # one that was removed may come again
+    files = dict.fromkeys(path for sink in queued for path in sink.files)  # a removed one may come again
     recordings = [path for path in files if path.suffix == ".rrd"]
     sizes = [path.stat().st_size for path in recordings if path.exists()]
     return content | {
@@ -153,13 +151,11 @@ def completed(
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     """The same as rows of name and value."""
     stills, worst, latency = content["stills"], content["worst_window_bps"], content["latency_ms"]
-    share = (
-        f"{content['total_bps'] / max(1, content['budget_bps']):.0%} of {bitrate_text(content['budget_bps'])}"
-    )
+    budget_bps = content["budget_bps"]
+    share = f"{content['total_bps'] / max(1, budget_bps):.0%} of {bitrate_text(budget_bps)}"
     outcomes, not_sent = (counts_text(stills["reasons"][which]) for which in ("outcomes", "not_sent"))
-    lossless = (
-        "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
-    )
+    gaps = content["gaps"]
+    lossless = f"{gaps} gaps, {content['lost']} messages lost" if gaps else "no gaps"
     changes = content["class_changes"]
     tracks = (
         f"{content['tracks']}; stills met {content['tracks_refined']} of them and changed the ground's own class "

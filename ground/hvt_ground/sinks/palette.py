@@ -21,11 +21,7 @@ BLUE: Rgb = (76, 140, 245)
 VERMILLION: Rgb = (232, 104, 40)
 PINK: Rgb = (222, 135, 180)
 GREY: Rgb = (170, 176, 184)
-
-BASE_LINE = SKY
-STILL_LINE = AMBER
-TOTAL_LINE: Rgb = (235, 238, 242)
-BUDGET_LINE = VERMILLION
+WHITE: Rgb = (235, 238, 242)
 
 # The first pattern that is found in a class name decides. The names are those of VisDrone, UAVDT, COCO and the
 # vehicles of ImageNet, so that "van" of a detector and "minivan" of a classifier look alike.

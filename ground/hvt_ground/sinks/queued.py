@@ -126,20 +126,17 @@ class QueuedSink(Generic[T]):
         with self._changed:
             if self._wait_s and not self._fits(size):
                 self._changed.wait_for(lambda: self._fits(size), self._wait_s)
-            if self._ending:
-                self.stored_losses += is_stored(item)
-            elif self._failing:
-                self.missing += 1
-                self.stored_losses += is_stored(item)
-            elif self._fits(size):
+            over = self._ending or self._failing
+            if not over and self._fits(size):
                 self._queue.append((item, size, self._skipped))
                 self._taken += 1
                 self._queued_bytes += size
                 self._skipped = 0
                 self._changed.notify_all()
-            else:
-                self.missing += 1
-                self.stored_losses += is_stored(item)
+                return
+            self.stored_losses += is_stored(item)
+            self.missing += not self._ending
+            if not over:
                 self._dropped += 1
                 self._skipped += 1
                 if self._dropped.bit_count() == 1:  # 1, 2, 4, 8 …

@@ -50,10 +50,8 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = (), records: 
 
     A ground that ``records`` without ``--record`` writes here.
     """
-    given = (
-        *(config.detector, config.classifier, config.labels, config.detector_labels),
-        *(config.zenoh_config,),
-    )
+    models = (config.detector, config.classifier, config.labels, config.detector_labels)
+    given = (*models, config.zenoh_config)
     reads = [*reads, *(Path(one) for one in given if one is not None)]
     for extra in extras_of(config):
         reads += extra.reads(config)

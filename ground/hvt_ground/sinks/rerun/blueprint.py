@@ -9,16 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
-from hvt_ground.sinks.palette import (
-    AMBER,
-    BASE_LINE,
-    BUDGET_LINE,
-    GREY,
-    STILL_LINE,
-    TOTAL_LINE,
-    class_colour,
-    dimmed,
-)
+from hvt_ground.sinks.palette import AMBER, GREY, SKY, VERMILLION, WHITE, class_colour, dimmed
 from hvt_ground.sinks.rerun.labels import LEGEND_POINTS, place_legend, points
 from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, REPORTED_MARK
 from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS
@@ -44,13 +35,13 @@ EVENTS = "/events"
 SESSION = "/session"
 
 _BITRATE = (
-    ("total", TOTAL_LINE, 1.5),
-    ("base", BASE_LINE, 2.0),
-    ("stills", STILL_LINE, 2.0),
-    ("budget", BUDGET_LINE, 1.5),
+    ("total", WHITE, 1.5),
+    ("base", SKY, 2.0),
+    ("stills", AMBER, 2.0),
+    ("budget", VERMILLION, 1.5),
 )
-_LATENCY = (("to receive", BASE_LINE, 2.0), ("to overlay", STILL_LINE, 2.0))
-_TRACKS = (("tracks", GREY, 2.0), ("refined", STILL_LINE, 2.5))
+_LATENCY = (("to receive", SKY, 2.0), ("to overlay", AMBER, 2.0))
+_TRACKS = (("tracks", GREY, 2.0), ("refined", AMBER, 2.5))
 
 _LEGEND = (
     f"□ seen on the base  ·  {REPORTED_MARK} reported only  ·  **thick** a still spoke  ·  "

@@ -54,7 +54,7 @@ class LiveView:
         self.kind = kind
         self.url = f"rerun+http://{_HOST}:{port}/proxy"
         self.page = (
-            f"http://{_HOST}:{web_port}/?url=rerun%2Bhttp://{_HOST}:{port}/proxy" if kind == "serve" else ""
+            f"http://{_HOST}:{web_port}/?url={self.url.replace('+', '%2B')}" if kind == "serve" else ""
         )
         """The address for a browser; empty for the native viewer."""
         displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")

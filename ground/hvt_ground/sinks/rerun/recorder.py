@@ -59,8 +59,11 @@ _LAYER_PATHS: dict[Layer, str] = {
     "doubted": names.DOUBTED,
     "labels": names.LABELS,
 }
-_NOTICE_COLOURS: dict[str, Rgb] = {"info": GREY, "warning": AMBER, "error": VERMILLION}
-_NOTICE_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+_NOTICES: dict[str, tuple[str, Rgb]] = {
+    "info": ("INFO", GREY),
+    "warning": ("WARN", AMBER),
+    "error": ("ERROR", VERMILLION),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +264,7 @@ class Recorder(SinkWriter[Event]):
             case PoseUpdate():
                 return self._pose(event)
             case Notice():
-                text = LogText(event.text, _NOTICE_LEVELS[event.level], _NOTICE_COLOURS[event.level])
+                text = LogText(event.text, *_NOTICES[event.level])
                 return [TableRow(names.EVENTS, "text", text, len(event.text))]
 
     def _pose(self, update: PoseUpdate) -> list[TableRow]:
@@ -314,20 +317,15 @@ class Recorder(SinkWriter[Event]):
         shape = "ellipses" if update.layer == "reported" else "boxes"
         for name, component in update.components.items():
             columns, value, count = name, component, 32
-            if name == "boxes":
-                columns, count = shape, len(component)
+            if name in ("boxes", "places", "words"):
+                columns, count = shape if name == "boxes" else name, len(component)
             elif name == "inks":
                 value = tuple(self._class_id(*ink) for ink in component)
-                rows += self._new_classes(update.layer)
             elif name == "identity":
-                columns, value, count = (
-                    f"identity of {shape}",
-                    self._coded(component),
-                    len(component.track_ids),
-                )
+                columns, count = f"identity of {shape}", len(component.track_ids)
+                value = self._coded(component)
+            if name in ("inks", "identity"):
                 rows += self._new_classes(update.layer)
-            elif name in ("places", "words"):
-                count = len(component)
             rows.append(TableRow(path, columns, value, _BYTES_EACH.get(name, 2) * count, at))
         return rows
 

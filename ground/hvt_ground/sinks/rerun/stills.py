@@ -200,21 +200,14 @@ def still_picture(refinement: Refinement) -> Coded | None:
     need not be written with each.
     """
     pixels = refinement.still_bgr  # the decoded pixels: the bytes themselves are a stranger's
-    if pixels is None:
-        pixels = _decoded(refinement.still)
+    if pixels is None and refinement.still:
+        pixels = cv2.imdecode(np.frombuffer(refinement.still, np.uint8), cv2.IMREAD_COLOR)  # type: ignore[assignment]
     if pixels is None or pixels.size == 0:
         return None
     size = (pixels.shape[1], pixels.shape[0])
     if refinement.media_type == "image/jpeg":
         return refinement.still, size
     return _jpeg(pixels, quality_pct=_STILL_QUALITY_PCT), size
-
-
-def _decoded(data: bytes) -> Image | None:
-    if not data:
-        return None
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    return None if pixels is None else pixels.astype(np.uint8)
 
 
 def base_picture(refinement: Refinement, *, still_size: tuple[int, int], limit_bytes: int) -> Coded | None:
