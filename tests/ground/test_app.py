@@ -29,12 +29,8 @@ ALIVE = "hvt/uav-1/alive"
 
 def config(port: int, folder: Path | None, **changes: Any) -> GroundConfig:
     """A light ground."""
-    listen = (f"tcp/127.0.0.1:{port}",)
-    return check(
-        GroundConfig(
-            listen=listen, record=folder, detector="motion", classifier="none", quiet=True, **changes
-        )
-    )
+    light = {"detector": "motion", "classifier": "none", "quiet": True}
+    return check(GroundConfig(listen=(f"tcp/127.0.0.1:{port}",), record=folder, **light, **changes))
 
 
 class Run:
@@ -53,8 +49,10 @@ class Run:
 
     @property
     def over(self) -> bool:
-        """Whether it has ended."""
         return not self._thread.is_alive()
+
+    def wait(self) -> None:
+        eventually(lambda: self.over, what="the ground has ended")
 
 
 @pytest.fixture
@@ -76,29 +74,22 @@ def test_once_it_ends_when_who_came_left_without_a_picture(free_port: int, tmp_p
                 clock.now_s = 61.0
                 time.sleep(0.5)
                 assert not run.over, "it is there, and may yet send a picture"
-            eventually(lambda: run.over, what="the ground has ended")
+            run.wait()
         assert run.sessions == []
     finally:
         run.stop.set()
 
 
 def test_once_it_ends_when_nobody_comes_in_time(free_port: int, tmp_path: Path, clock) -> None:
-    """A script would wait for ever for an edge that does not start."""
-    run = Run(config(free_port, tmp_path, once=True, wait=60.0))
+    """A script would wait for ever for an edge that does not start; what an earlier ground recorded be destroyed."""
+    (tmp_path / "f.rrd").write_text("flight")
+    run = Run(config(free_port, tmp_path / "f.rrd", once=True, wait=60.0))
     clock.now_s = 59.0
     time.sleep(0.5)
     assert not run.over
     clock.now_s = 61.0
-    eventually(lambda: run.over, what="the ground has ended")
+    run.wait()
     assert run.sessions == []
-
-
-def test_it_writes_nothing_over_what_an_earlier_one_recorded(free_port: int, tmp_path: Path, clock) -> None:
-    """A ground that died and is started again would destroy the flight so far."""
-    (tmp_path / "f.rrd").write_text("flight")
-    run = Run(config(free_port, tmp_path / "f.rrd", once=True, wait=60.0))
-    clock.now_s = 61.0
-    eventually(lambda: run.over, what="the ground has ended")
     assert [one.read_text() for one in tmp_path.glob("earlier-*/f.rrd")] == ["flight"]
 
 
@@ -109,15 +100,11 @@ def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path, cl
     time.sleep(0.5)
     assert not run.over
     run.stop.set()
-    eventually(lambda: run.over, what="the ground has ended")
+    run.wait()
 
 
 def test_a_listener_that_hears_nothing_any_more_is_made_anew(
-    free_port: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    clock: SimpleNamespace,
+    free_port: int, tmp_path: Path, monkeypatch, caplog, clock
 ) -> None:
     """No picture would come back once the ground's radio was plugged in anew, or the ground stood still.
 
@@ -136,7 +123,7 @@ def test_a_listener_that_hears_nothing_any_more_is_made_anew(
         with joined(f"tcp/127.0.0.1:{free_port}") as outsider, outsider.liveliness().declare_token(ALIVE):
             eventually(lambda: "hvt-receive-uav-1" in [one.name for one in threading.enumerate()])
         clock.now_s = 61.0
-        eventually(lambda: run.over, what="the ground has ended")
+        run.wait()
     finally:
         run.stop.set()
 
@@ -149,60 +136,59 @@ class Brings(Extra):
         self.service.shown_to_others = shown
 
     def serve(self, *_: Any, **__: Any) -> Service:
-        """One that others see there, or nowhere."""
         return self.service
+
+
+@pytest.fixture
+def service(monkeypatch) -> Service:
+    """Of the one extra that is there."""
+    brings = Brings()
+    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
+    return brings.service
 
 
 @pytest.mark.parametrize("program", [None, lambda _info: None])
 def test_it_records_where_it_is_started_and_says_so_unless_a_program_takes_all(
-    free_port: int, monkeypatch: pytest.MonkeyPatch, program: Any
+    free_port: int, service, monkeypatch, program: Any
 ) -> None:
     """NOT RECORDED stood beside recordings; a program was refused for a folder that it leaves alone."""
-    brings, states = Brings(), list[Any]()
-    monkeypatch.setattr(brings.service, "show", states.append)
-    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
+    states = list[Any]()
+    service.show = states.append
     monkeypatch.setattr(os, "access", lambda *_: program is None)
     run = Run(config(free_port, None), program=program)
     eventually(lambda: states, what="a state")
     run.stop.set()
-    eventually(lambda: run.over, what="the ground has ended")
+    run.wait()
     assert states[0].recorded == (program is None)
 
 
-def test_an_extra_that_raises_takes_nothing_with_it(
-    free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_extra_that_raises_takes_nothing_with_it(free_port: int, tmp_path: Path, service) -> None:
     """A page that could not show a state ended the ground, without a summary; an index the recording."""
-    brings, states = Brings(), list[Any]()
+    states = list[Any]()
 
     def show(state: Any) -> None:
         states.append(state)
         raise RuntimeError("no room")
 
-    monkeypatch.setattr(brings.service, "show", show)
-    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
+    service.show = show
     run = Run(config(free_port, tmp_path))
     eventually(lambda: states and states[-1].failed, what="it is said")
     run.stop.set()
-    eventually(lambda: run.over, what="the ground has ended")
-    assert [(one.part, one.reason) for one in states[-1].failed] == [
-        ("extra hvt_ground", "RuntimeError: no room")
-    ]
+    run.wait()
+    (failed,) = states[-1].failed
+    assert (failed.part, failed.reason) == ("extra hvt_ground", "RuntimeError: no room")
     assert run.sessions == []
 
 
-def test_an_extra_that_hangs_holds_itself_alone(
-    free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_extra_that_hangs_holds_itself_alone(free_port: int, tmp_path: Path, service) -> None:
     """A page that did not return from a state kept the ground from new edges, and from its end."""
-    brings, shown, hung = Brings(), list[Any](), threading.Event()
-    monkeypatch.setattr(brings.service, "show", lambda state: (shown.append(state), hung.wait()))
-    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
+    shown, hung = list[Any](), threading.Event()
+    service.show = lambda state: (shown.append(state), hung.wait())
     run = Run(config(free_port, tmp_path))
     try:
         eventually(lambda: shown, what="a state")
         run.stop.set()
-        eventually(lambda: run.over, what="the ground has ended")
+        run.wait()
         assert len(shown) == 1, "the newest state waits for no earlier one"
     finally:
         hung.set()

@@ -20,7 +20,7 @@ from hvt_common.video.still_codecs import JpegCodec
 from hvt_fleet.commands import run
 from hvt_ground import control
 from hvt_ground.cli import main
-from hvt_ground.control import EdgeClient, RefusedError, RequestedStill
+from hvt_ground.control import EdgeClient, RefusedError, RemoteEdge, RequestedStill
 from programs.processes import PATIENT_S
 from rigs import messages
 
@@ -60,7 +60,6 @@ class ScriptedEdge:
         self.ends, self.answers = False, True
 
     def control(self, question: bytes) -> bytes | None:
-        """Note the request."""
         if not self.answers:
             return None
         request = ControlRequest.parse(question)
@@ -76,7 +75,6 @@ class ScriptedEdge:
             self._status.put(replace(messages.STATUS, session_id=7, state="ended").pack())
 
     def serve(self, session: zenoh.Session) -> None:
-        """As an edge does."""
         self._publisher = declare_publisher(session, Channel.ROI, keys=KEYS)
         self._status = declare_publisher(session, Channel.STATUS, keys=KEYS)
         serve(session, Channel.INFO, keys=KEYS, answer=lambda _question: INFO.pack())
@@ -94,6 +92,13 @@ def edge(free_port, monkeypatch) -> Iterator[ScriptedEdge]:
     ):
         scripted.serve(session)
         yield scripted
+
+
+@pytest.fixture
+def uav(edge) -> Iterator[RemoteEdge]:
+    """The same, as one asks it."""
+    with EdgeClient.connect(edge.endpoint) as edges:
+        yield edges["uav-1"]
 
 
 def test_the_still_of_the_number_is_the_one_that_is_returned(edge):
@@ -117,46 +122,50 @@ def test_the_still_of_the_number_is_the_one_that_is_returned(edge):
 
 
 @pytest.mark.parametrize(
-    "header",
+    "changes",
     [
-        replace(HEADER, crop_source_px=(0, 0, 5000, 5000)),
-        replace(HEADER, crop_source_px=(10, 20, 500, 400)),
-        replace(HEADER, codec="residual"),
-        replace(HEADER, codec="own"),
+        {"crop_source_px": (0, 0, 5000, 5000)},
+        {"crop_source_px": (10, 20, 500, 400)},
+        {"codec": "residual"},
+        {"codec": "own"},
     ],
 )
-def test_a_still_that_cannot_be_one_is_a_sentence(edge, header):
+def test_a_still_that_cannot_be_one_is_a_sentence(edge, uav, changes):
     """A hostile edge could make the operator's machine decode anything, or end in a traceback."""
-    edge.puts = [(DATA, header.pack(DATA))]
-    with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(UserError, match="cannot be decoded"):
-        edges["uav-1"].still(timeout_s=PATIENT_S)
+    edge.puts = [(DATA, replace(HEADER, **changes).pack(DATA))]
+    with pytest.raises(UserError, match="cannot be decoded"):
+        uav.still(timeout_s=PATIENT_S)
 
 
-def test_refusals_are_the_edges_own_words(edge):
+def test_refusals_are_the_edges_own_words(edge, uav):
     """The operator would not know what to ask instead."""
     edge.answer = replace(YES, accepted=False, reason="there is no track 9 at frame 4")
-    with EdgeClient.connect(edge.endpoint) as edges:
+    for ask in (lambda: uav.still(track=9), lambda: uav.set_budget(5)):
         with pytest.raises(RefusedError, match="uav-1 refuses: there is no track 9 at frame 4"):
-            edges["uav-1"].still(track=9)
-        with pytest.raises(RefusedError):
-            edges["uav-1"].set_budget(5)
+            ask()
 
 
-def test_a_still_that_was_given_up_is_not_waited_for(edge):
+def test_a_still_that_was_given_up_is_not_waited_for(edge, uav):
     """The operator would look at nothing until the timeout, and then not know why."""
     edge.puts = []
     edge.outcome = replace(YES, accepted=False, reason="in 10 s the budget had no room for it")
-    with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(RefusedError, match="no room for it"):
-        edges["uav-1"].still(timeout_s=PATIENT_S)
-    assert [one.command for one in edge.asked] == ["still", "still-outcome"]
-    assert edge.asked[1].arguments == {"ask": 3}
+    with pytest.raises(RefusedError, match="no room for it"):
+        uav.still(timeout_s=PATIENT_S)
+    assert [(one.command, one.arguments) for one in edge.asked] == [
+        ("still", {}),
+        ("still-outcome", {"ask": 3}),
+    ]
 
 
-def test_an_edge_that_ends_meanwhile_says_so(edge):
-    """The operator would blame the budget or the link, and wait for an edge that has landed."""
-    edge.puts, edge.ends = [], True
-    with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(UserError, match="uav-1 has ended"):
-        edges["uav-1"].still(timeout_s=PATIENT_S)
+@pytest.mark.parametrize(
+    ("ends", "timeout_s", "said"),
+    [(True, PATIENT_S, "uav-1 has ended"), (False, 0.5, r"not come within 0\.5 s")],
+)
+def test_a_still_that_does_not_come_any_more_is_said(edge, uav, ends, timeout_s, said):
+    """The operator would blame the budget, and wait for an edge that has landed; a program hang with the link."""
+    edge.puts, edge.ends = [], ends
+    with pytest.raises(UserError, match=said):
+        uav.still(timeout_s=timeout_s)
 
 
 def test_how_it_comes_is_said_before_it_comes(edge, tmp_path, capsys):
@@ -168,16 +177,6 @@ def test_how_it_comes_is_said_before_it_comes(edge, tmp_path, capsys):
     assert capsys.readouterr().out.startswith("uav-1: 96x64 pixels at quality 40 come within about 3 s\n")
 
 
-def test_one_that_never_comes_ends_with_the_timeout(edge):
-    """A program that asks would hang with the link."""
-    edge.puts = []
-    with (
-        EdgeClient.connect(edge.endpoint) as edges,
-        pytest.raises(UserError, match=r"not come within 0\.5 s"),
-    ):
-        edges["uav-1"].still(timeout_s=0.5)
-
-
 def test_an_answer_that_is_none_is_a_sentence(edge):
     """A traceback would say nothing of the edge that is not there."""
     with EdgeClient.connect(edge.endpoint) as edges:
@@ -186,27 +185,16 @@ def test_an_answer_that_is_none_is_a_sentence(edge):
         with pytest.raises(UserError, match="edge id 'UAV 1'"):
             edges["UAV 1"].keyframe()
         edge.answers = False  # and nobody looks for rights where there are no keys
-        with pytest.raises(
-            UserError, match=r"uav-1 does not answer on control: the link is full, or has lost it$"
-        ):
+        said = r"uav-1 does not answer on control: the link is full, or has lost it$"
+        with pytest.raises(UserError, match=said):
             edges["uav-1"].keyframe()
 
 
 def test_the_command_finds_the_only_edge_and_writes_the_file_as_it_came(edge, tmp_path, capsys):
     """The picture on disk would have lost twice; `--at -3s` would be taken for a flag."""
     out = tmp_path / "crop.jpg"
-    words = [
-        "still",
-        "--connect",
-        edge.endpoint,
-        "--track",
-        "17",
-        "--at",
-        "-3s",
-        "--out",
-        str(out),
-        "--timeout=60s",
-    ]
+    words = ["still", "--connect", edge.endpoint, "--track", "17", "--at", "-3s", "--timeout=60s"]
+    words += ["--out", str(out)]
     assert main(words) == 0
     assert out.read_bytes() == DATA
     assert edge.asked[0].arguments == {"track": 17, "at_ms": -3000}

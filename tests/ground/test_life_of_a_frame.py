@@ -20,15 +20,10 @@ TO_THE_PICTURE, TO_THE_TRACKS = 10, 12
 """Files of the ground that a frame enters at most in the receiving thread, and in those of perception."""
 
 
-class Events:
+class Events(list[Event]):
     """A sink that lists what it gets."""
 
-    def __init__(self) -> None:
-        self.all: list[Event] = []
-
-    def log(self, event: Event) -> None:
-        """Add it."""
-        self.all.append(event)
+    log = list.append
 
     def close(self, hurry=None) -> None:
         """Nothing."""
@@ -71,13 +66,13 @@ def test_a_frame_walks_through_few_files(walk: Walk) -> None:
     assert edge.session is not None
     eventually(lambda: edge.session.idle)
     walk.files.clear()
-    sink.all.clear()
+    sink.clear()
     before = sys.getprofile()
     sys.setprofile(walk.profile)
     edge.handle(flight.base(7))
     sys.setprofile(before)
     eventually(lambda: edge.session.idle)
-    assert [one.frame_index for one in sink.all if isinstance(one, VideoSample | Overlay)][:2] == [7, 7]
+    assert [one.frame_index for one in sink if isinstance(one, VideoSample | Overlay)][:2] == [7, 7]
     receiving = walk.files.pop(threading.current_thread().name)
     analyzing = set[str]().union(*walk.files.values())  # worker and detector have a thread each
     assert len(receiving) <= TO_THE_PICTURE, sorted(receiving)

@@ -7,7 +7,7 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 
@@ -25,6 +25,7 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
 from programs.processes import eventually
@@ -43,7 +44,6 @@ class Compiler:
         monkeypatch.setattr(ground_models, "open_detector", self.open)
 
     def open(self, *_: object, **__: object) -> RedSquares:
-        """Wait for it."""
         self.done.wait(60)
         if self.error is not None:
             raise self.error
@@ -58,21 +58,39 @@ def compiler(monkeypatch: pytest.MonkeyPatch):
     compiler.done.set()
 
 
+def listening(port: int) -> GroundConfig:
+    return check(GroundConfig(listen=(f"tcp/127.0.0.1:{port}",), classifier="none", quiet=True))
+
+
 def nothing(_info: object):
     """A program that takes nothing, in place of a recording."""
-    return lambda: SimpleNamespace(
-        path=None, awaits_keyframe=False, log=lambda _: None, close=lambda _=None: None
-    )
+    parts = {"path": None, "awaits_keyframe": False, "log": lambda _: None, "close": lambda _=None: None}
+    return lambda: SimpleNamespace(**parts)
+
+
+class Loading:
+    """A ground of one edge, of which no detector is open yet."""
+
+    def __init__(self, flight: Flight, config: GroundConfig, **parts: Any) -> None:
+        self.outputs, self.models = Outputs(Failures(time.time_ns)), Models(check(config))
+        self.factory = SessionFactory(
+            check(config), self.models, clock=time.time_ns, outputs=self.outputs, view=None, **parts
+        )
+        self.ended: list[Session] = []
+        port = Port()
+        port.flight = flight
+        self.sessions = EdgeSessions(port, open_session=self.factory.open_session, on_ended=self.ended.append)
+
+    def close(self) -> None:
+        self.sessions.close()
+        self.outputs.close()
 
 
 def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compiler, tmp_path: Path) -> None:
     """A viewer on a busy machine saw nothing for 40 s, and nothing of them was recorded."""
-    config = check(GroundConfig(classifier="none", record=tmp_path / "a.rrd"))
-    outputs, models = Outputs(Failures(time.time_ns)), Models(config)
-    factory = SessionFactory(config, models, clock=time.time_ns, outputs=outputs, view=None)
-    ended, flight, port = [], Flight(FRAMES), Port()
-    port.flight = flight
-    sessions = EdgeSessions(port, open_session=factory.open_session, on_ended=ended.append)
+    flight = Flight(FRAMES)
+    ground = Loading(flight, GroundConfig(classifier="none", record=tmp_path / "a.rrd"))
+    models, sessions = ground.models, ground.sessions
     maker = StateMaker(time.time_ns, loading=lambda: models.loading)
     for index in range(FRAMES - 1):
         sessions.handle(flight.base(index))
@@ -85,9 +103,8 @@ def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compi
     sessions.handle(flight.base(FRAMES - 1))
     eventually(lambda: sessions.session.perceived.tracks == 1, what="a box")
     assert "loading" not in status_text(maker.make([("uav-1", sessions)]))
-    sessions.close()
-    outputs.close()
-    assert summary(ended[0])["tracks"] == 1
+    ground.close()
+    assert summary(ground.ended[0])["tracks"] == 1
     assert len(Recording(tmp_path / "a.rrd").video()) == FRAMES
 
 
@@ -99,12 +116,9 @@ def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(
 
     And where the detector was none, that all else goes on, a line before the end.
     """
-    config = check(GroundConfig(classifier="none"))
-    outputs, models = Outputs(Failures(time.time_ns)), Models(config)
-    factory = SessionFactory(config, models, clock=time.time_ns, outputs=outputs, view=None, program=nothing)
-    ended, flight, port = [], Flight(2, pace="lockstep"), Port()
-    port.flight = flight
-    sessions = EdgeSessions(port, open_session=factory.open_session, on_ended=ended.append)
+    flight = Flight(2, pace="lockstep")
+    ground = Loading(flight, GroundConfig(classifier="none"), program=nothing)
+    models, sessions = ground.models, ground.sessions
     for index in range(3):
         if index == fails_before:
             compiler.error = UserError("d.onnx is not a detector")
@@ -117,39 +131,35 @@ def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(
     closing.start()
     closing.join(60)
     assert not closing.is_alive()
-    content = summary(ended[0])
+    content = summary(ground.ended[0])
     assert (content["frames_decoded"], content["failure"]) == (2, "")
     told = completed(content, sessions)
     assert told["failed"] == []
     assert dict(table(told))["tracks"] == "not known: the detector has looked at no picture"
-    outputs.close()
+    ground.outputs.close()
 
 
 def test_a_stored_still_that_nobody_read_before_the_run_ended_comes_again(compiler) -> None:
     """The edge would take it for recorded, and forget it."""
-    models = Models(check(GroundConfig(classifier="none")))
-    outputs, config = Outputs(Failures(time.time_ns)), GroundConfig(classifier="none")
-    factory = SessionFactory(config, models, clock=time.time_ns, outputs=outputs, view=None, program=nothing)
-    flight, port, done = Flight(2), Port(), list[bool | None]()
-    port.flight = flight
-    sessions = EdgeSessions(port, open_session=factory.open_session)
-    sessions.handle(flight.base(0))
+    flight, done = Flight(2), list[bool | None]()
+    ground = Loading(flight, GroundConfig(classifier="none"), program=nothing)
+    ground.sessions.handle(flight.base(0))
     item = flight.still(0, 0)
     still = ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
-    backlog = sessions.session.backlog
+    backlog = ground.sessions.session.backlog
     job = read_still(still, lambda: nullcontext(backlog), done=done.append)
-    models.give_up()
+    ground.models.give_up()
     with pytest.raises(NotOpenError):
         next(job)
     assert done == [None]
     assert backlog.is_new_still(still.header.sequence)
-    sessions.close()
+    ground.sessions.close()
 
 
 def test_the_link_is_open_before_the_detector(compiler, free_port: int, monkeypatch) -> None:
     """An edge would find nobody, and fly its first minute for no one."""
     stop = threading.Event()
-    config = check(GroundConfig(listen=(f"tcp/127.0.0.1:{free_port}",), classifier="none", quiet=True))
+    config = listening(free_port)
     made: list[Models] = []
     monkeypatch.setattr(app, "Models", lambda config: made.append(Models(config)) or made[-1])
     assert Ground(config, stop=stop, on_started=stop.set).run() == []
@@ -160,7 +170,7 @@ def test_the_link_is_open_before_the_detector(compiler, free_port: int, monkeypa
 def test_a_detector_that_is_none_after_all_ends_the_run_with_its_sentence(compiler, free_port: int) -> None:
     """The ground would go on for hours without a box."""
     compiler.error = UserError("d.onnx is not a detector")
-    config = check(GroundConfig(listen=(f"tcp/127.0.0.1:{free_port}",), classifier="none", quiet=True))
+    config = listening(free_port)
     with pytest.raises(UserError, match=r"d\.onnx is not a detector"):
         Ground(config, stop=threading.Event(), on_started=compiler.done.set).run()
 
@@ -176,18 +186,12 @@ class Broken(Service):
 
 def test_an_extra_that_raises_takes_no_session_and_no_recording_with_it(tmp_path: Path) -> None:
     """No picture of any edge was recorded, for a session with it could not be opened."""
-    config = check(GroundConfig(detector="motion", classifier="none", record=tmp_path / "a.rrd"))
-    outputs, models = Outputs(Failures(time.time_ns)), Models(config)
-    factory = SessionFactory(
-        config, models, clock=time.time_ns, outputs=outputs, view=None, services=[Broken()]
-    )
-    flight, port = Flight(2), Port()
-    port.flight = flight
-    sessions = EdgeSessions(port, open_session=factory.open_session)
+    flight = Flight(2)
+    config = GroundConfig(detector="motion", classifier="none", record=tmp_path / "a.rrd")
+    ground = Loading(flight, config, services=[Broken()])
     for index in range(2):
-        sessions.handle(flight.base(index))
-    sessions.close()
-    outputs.close()
+        ground.sessions.handle(flight.base(index))
+    ground.close()
     assert len(Recording(tmp_path / "a.rrd").video()) == 2
-    assert [one.reason for one in models.failures.parts] == ["RuntimeError: broken"]
-    assert outputs.idle
+    assert [one.reason for one in ground.models.failures.parts] == ["RuntimeError: broken"]
+    assert ground.outputs.idle

@@ -12,13 +12,15 @@ SECOND_NS = 1_000_000_000
 
 def pose(second: float, *, north: float = 0.0, yaw: float = 0.0) -> Pose:
     """On its way north."""
-    return Pose(
-        round(second * SECOND_NS),
-        50.0 + north / 111_229,
-        10.0,
-        height_m=50.0,
-        camera=Orientation(yaw, -60, 0),
-    )
+    at_ns, latitude_deg = round(second * SECOND_NS), 50.0 + north / 111_229
+    return Pose(at_ns, latitude_deg, 10.0, height_m=50.0, camera=Orientation(yaw, -60, 0))
+
+
+def trail_of(*poses: Pose) -> PoseTrail:
+    trail = PoseTrail()
+    for one in poses:
+        assert trail.add(one)
+    return trail
 
 
 @pytest.mark.parametrize(
@@ -28,10 +30,7 @@ def pose(second: float, *, north: float = 0.0, yaw: float = 0.0) -> Pose:
 )
 def test_a_pose_at_a_moment(second, north, yaw, position_error_m):
     """Places would jump once a second, or stay where the drone was a second ago."""
-    trail = PoseTrail()
-    trail.add(pose(0))
-    trail.add(pose(1, north=20, yaw=10))
-    found = trail.at(round(second * SECOND_NS))
+    found = trail_of(pose(0), pose(1, north=20, yaw=10)).at(round(second * SECOND_NS))
     assert found is not None
     assert found.latitude_deg == pytest.approx(50 + north / 111_229, abs=1e-8)
     assert found.camera is not None
@@ -42,28 +41,22 @@ def test_a_pose_at_a_moment(second, north, yaw, position_error_m):
 
 def test_a_camera_that_stands_is_as_sure_as_it_was():
     """A fixed camera's places would grow vague between two reports."""
-    trail = PoseTrail()
-    trail.add(pose(0))
-    trail.add(pose(1))
-    found = trail.at(5 * SECOND_NS)
+    found = trail_of(pose(0), pose(1)).at(5 * SECOND_NS)
     assert found is not None
     assert (found.position_error_m, found.angle_error_deg) == (3.0, 2.0)
 
 
 def test_ten_seconds_old_is_no_pose():
     """An aircraft that is gone would still place what it sees."""
-    trail = PoseTrail()
-    assert trail.at(0) is None
-    trail.add(pose(0))
+    trail = trail_of(pose(0))
+    assert PoseTrail().at(0) is None
     assert trail.at(10 * SECOND_NS) is not None
     assert trail.at(10 * SECOND_NS + 1) is None
 
 
 def test_one_pose_of_the_future_does_not_hold_for_the_rest_of_the_flight():
     """The map would show one place, as if it were of now, until that time is there."""
-    trail = PoseTrail()
-    trail.add(pose(0))
-    trail.add(pose(1e6))
+    trail = trail_of(pose(0), pose(1e6))
     taken = [trail.add(pose(second)) for second in range(1, 20)]
     assert taken == 4 * [False] + 15 * [True]
     assert trail.newest == pose(19)

@@ -42,21 +42,11 @@ def events() -> list[Event]:
     return [event for _, _, event in sorted(timed, key=lambda one: one[:2])]
 
 
-class Rows:
-    """An index that remembers what it was told."""
-
-    def __init__(self) -> None:
-        self.rows: dict[str, RecordingRow] = {}
-
-    def log(self, item: RecordingRow) -> None:
-        """Take the newest row of a file."""
-        self.rows[item.file] = item
-
-
-def recorded(folder: Path, events: list[Event], split: Limit = SPLIT) -> tuple[list[Path], Rows]:
-    """The files, in the order of their names."""
-    rows = Rows()
-    sink = SessionFiles(settings(folder / "flight.rrd"), split=split, tell=rows.log)
+def recorded(folder: Path, events: list[Event], split: Limit = SPLIT) -> tuple[list[Path], dict]:
+    """The files, in the order of their names, and the newest row that an index was told of each."""
+    rows: dict[str, RecordingRow] = {}
+    tell = lambda row: rows.update({row.file: row})  # noqa: E731
+    sink = SessionFiles(settings(folder / "flight.rrd"), split=split, tell=tell)
     for event in events:
         sink.log(event)
     sink.close()
@@ -119,7 +109,7 @@ def test_events_and_plots_are_in_one_file_each(parts: list[Path], whole: Recordi
 def test_the_index_learns_what_is_in_each(events: list[Event], tmp_path: Path) -> None:
     """The hour with the truck would be found by opening them all."""
     paths, told = recorded(tmp_path, events)
-    rows = [told.rows[one.name] for one in paths]
+    rows = [told[one.name] for one in paths]
     assert [row.frames for row in rows] == [30, 30, 30, 10]
     assert all(row.whole and not row.backlog for row in rows)
     assert [row.size_bytes for row in rows] == [one.stat().st_size for one in paths]
@@ -150,7 +140,7 @@ def test_a_clock_that_is_set_back_does_not_stop_the_splitting(events: list[Event
 def test_without_perception_files_end_too(events: list[Event], tmp_path: Path) -> None:
     """A detector that failed would hold two files open for the rest of the flight."""
     paths, told = recorded(tmp_path, [one for one in events if isinstance(one, VideoSample)])
-    assert [row.frames for row in told.rows.values()] == [30, 30, 30, 10]
+    assert [row.frames for row in told.values()] == [30, 30, 30, 10]
     assert [Recording(one).blueprints for one in paths] == [1, 1, 1, 1]
 
 
@@ -181,7 +171,7 @@ def test_backlog_of_a_former_file_lies_beside_it(events: list[Event], tmp_path: 
     assert sorted(beside.boxes(15)) == list(range(1, TRACKS + 1))
     assert {box.class_after for box in beside.boxes(15).values()} == {"car", "van", "truck"}
     subprocess.run([viewer_program(), "rrd", "verify", paths[0]], check=True, capture_output=True)
-    row = told.rows["flight-0001-backlog.rrd"]
+    row = told["flight-0001-backlog.rrd"]
     assert (row.backlog, row.frames, row.whole) == (True, 20, True)
     frames = [frame for one in paths for frame, *_ in Recording(one).video()]
     assert sorted(frames) == list(range(FRAMES)), "all of them, none twice"
@@ -262,6 +252,5 @@ def test_a_file_that_breaks_off_is_described_up_to_there(parts: list[Path], tmp_
     broken = tmp_path / "hvt-uav-1-20261122-130000.rrd"
     broken.write_bytes(parts[0].read_bytes()[: parts[0].stat().st_size * 2 // 3])
     row = described(broken)
-    assert row is not None
     assert (row.edge, row.session, row.size_bytes) == ("uav-1", "00ff", broken.stat().st_size)
     assert 0 < row.frames <= 30

@@ -8,8 +8,10 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from http.client import HTTPConnection
+from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -20,7 +22,7 @@ from hvt_common.units import SECOND_NS
 from hvt_fleet.health import ground_status as watch
 from hvt_fleet.health.ground_metrics import metrics_text
 from hvt_ground.link import receiver
-from hvt_ground.report.state import SessionState, StateMaker
+from hvt_ground.report.state import GroundState, SessionState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -50,7 +52,6 @@ class Ground:
         self.sessions = EdgeSessions(self.port, open_session=self.open_one, on_ended=self.ended.append)
 
     def open_one(self, info: Info, reports: ReceiverReports) -> Session:
-        """A session with recordings."""
         settings = RecorderSettings(self.path, info.edge, "1", info.base_size, info.fps, info.budget_bps)
         gone = replace(settings, path=self.path / "no" / "folder.rrd")
         sinks = [
@@ -63,9 +64,27 @@ class Ground:
         )
         return self.opened[-1]
 
+    def state(self) -> GroundState:
+        return self.maker.make([("uav-1", self.sessions)])
+
     def line(self) -> str:
         """The status line."""
-        return status_text(self.maker.make([("uav-1", self.sessions)]))
+        return status_text(self.state())
+
+    def metrics(self) -> str:
+        return metrics_text(self.state()).decode()
+
+    def report(self, change: Callable[[Status], Status]) -> None:
+        """The edge reports."""
+        item = self.port.flight.status(base=5)
+        report = change(Status.parse(item.payload))
+        self.sessions.handle(replace(item, payload=report.pack()))
+
+    def end(self) -> dict[str, Any]:
+        """Its summary."""
+        self.sessions.close()
+        self.outputs.close()
+        return summary(self.ended[0])
 
 
 class Shown:
@@ -74,14 +93,12 @@ class Shown:
     captured_ms = 0.0
 
     def post(self, call: Callable[[], None]) -> None:
-        """Do it at once."""
         call()
 
     def begin(self, *_: object) -> None:
         """A session begins."""
 
     def notice(self, _: EdgePage, message: str) -> None:
-        """An event."""
         self.captured_ms = json.loads(message)["captured"]
 
     def overlay(self, *_: object) -> None:
@@ -95,24 +112,20 @@ def ground(tmp_path: Path) -> Ground:
     ground = Ground(tmp_path, flight)
     for index in range(5):
         ground.sessions.handle(flight.base(index))
-    item = flight.status(base=5)
-    report = replace(
-        Status.parse(item.payload), deferred={"cooldown": 3}, dropped={"base_good": 49, "too_large": 1}
-    )
-    ground.sessions.handle(replace(item, payload=report.pack()))
+    counts = {"deferred": {"cooldown": 3}, "dropped": {"base_good": 49, "too_large": 1}}
+    ground.report(lambda status: replace(status, **counts))
     eventually(lambda: ground.opened[0].idle, what="the pictures are searched")
     return ground
 
 
 def test_the_page_reads_all_of_it_as_sentences(ground):
     """``base_good 49`` and ``stills paused: 0 of 40`` say nothing to who flies."""
-    state = ground.maker.make([("uav-1", ground.sessions)])
+    state = ground.state()
     (edge,) = state.edges
     every = dict.fromkeys(STILL_WORDS, 2)
     decisions = "tracks: the video hides 31 objects; stills paused: they name 0 of 40 otherwise"
-    session = replace(
-        edge.session, still_outcomes=every, stills_not_sent=every, decisions=decisions, gaps=2, lost=3
-    )
+    says = {"still_outcomes": every, "stills_not_sent": every, "decisions": decisions}
+    session = replace(edge.session, **says, gaps=2, lost=3)
     state = replace(state, edges=(replace(edge, session=session),), failed=ground.failures.now)
     shown = json.loads(state_message(state))["edges"]["uav-1"]
     code = re.compile("|".join(word for word in STILL_WORDS if "_" in word))
@@ -127,28 +140,25 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
 def test_who_gets_no_stills_reads_why(ground):
     """49 stills that the base made needless looked like a fault of the link."""
     assert "stills 0 (not sent: 49 the video already shows well, 3 sent a moment ago)" in ground.line()
-    ground.sessions.close()
-    ground.outputs.close()
-    content = summary(ground.ended[0])
+    content = ground.end()
     assert content["stills"]["reasons"]["not_sent"] == {"base_good": 49, "cooldown": 3, "too_large": 1}
     said = "49 the video already shows well, 3 sent a moment ago, 1 too large for the budget"
     assert said in dict(table(content))["stills"]
     met = dict(table(content | {"tracks": 3, "tracks_refined": 1, "class_changes": 2}))["tracks"]
     assert met == "3; stills met 1 of them and changed the ground's own class 2 times"
-    assert f"the edge did not send these stills: {said}" in [
-        text for _, _, text in Recording(ground.path).events()
-    ]
+    events = [text for _, _, text in Recording(ground.path).events()]
+    assert f"the edge did not send these stills: {said}" in events
 
 
 def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monkeypatch, capsys):
     """Who came later, or reads tables alone, took guesses for objects."""
     assert "UNKNOWN VIEW" not in ground.line()
-    text = metrics_text(ground.maker.make([("uav-1", ground.sessions)])).decode()
+    text = ground.metrics()
     assert "hvt_view_unlike{" not in text, "nobody knows yet"
     trust = ground.opened[0].pipeline.trust
     trust.mean, trust.unlike = 0.53, True
     assert "refined  UNKNOWN VIEW" in ground.line()
-    state = ground.maker.make([("uav-1", ground.sessions)])
+    state = ground.state()
     assert (state.edges[0].session.view_trust, state.edges[0].session.view_unlike) == (0.53, True)
     shown = json.loads(state_message(state))["edges"]["uav-1"]
     assert any(one.startswith("this view is unlike") for one in shown["words"])
@@ -164,9 +174,7 @@ def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monke
     shown = capsys.readouterr().out
     assert "0 refined, UNKNOWN VIEW" in shown
     assert "detector loading" in shown
-    ground.sessions.close()
-    ground.outputs.close()
-    content = summary(ground.ended[0])
+    content = ground.end()
     assert (content["view_trust"], content["view_unlike"]) == (0.53, True)
     assert dict(table(content))["view"] == "unlike what the detector knows (trust 0.53)"
 
@@ -183,8 +191,7 @@ def test_a_link_that_carries_nothing_is_lost_in_the_line(ground, monkeypatch):
     assert "kbps" not in line
     ground.sessions.handle(ground.port.flight.base(6))
     assert "LINK LOST" not in ground.line()
-    ground.sessions.close()
-    ground.outputs.close()
+    ground.end()
 
 
 def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
@@ -197,7 +204,7 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
     traffic = ground.sessions.session.reception.traffic(now_ns[0])
     assert (traffic.receive_latency_ms, traffic.overlay_latency_ms) == (None, None), "a recording plots them"
     now_ns[0] += 4 * SECOND_NS
-    (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
+    (edge,) = ground.state().edges
     assert edge.session.picture_age_s == pytest.approx(4.0, abs=0.2)
     assert edge.session.delay_p50_ms is None
     shown = Shown()
@@ -208,9 +215,7 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
     ground.sessions.session.note("info", "a line")
     came_ms = (now_ns[0] - 4 * SECOND_NS + SECOND_NS // 15) / 1e6  # it waited behind the hole
     assert shown.captured_ms == pytest.approx(came_ms, abs=5)
-    ground.sessions.close()
-    ground.outputs.close()
-    content = summary(ground.ended[0])
+    content = ground.end()
     assert content["frames_decoded"] == 6
     assert content["latency_ms"]["p50"] is None
     assert "latency" not in dict(table(content)), "it said ``capture to overlay: p50 12 ms``"
@@ -222,20 +227,17 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
 def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     """Whoever looks for a recording after the flight would learn only then that there is none, and never why."""
     eventually(lambda: "second recording of uav-1 FAILED at " in ground.line(), what="it failed")
-    ground.sessions.close()
-    ground.outputs.close()
+    content = ground.end()
     sinks = ground.ended[0].sinks
     for one in sinks:
         one.files *= 2  # removed in flight, it began anew under its name
-    content = completed(summary(ground.ended[0]), ground.sessions, sinks=sinks, failures=ground.failures)
+    content = completed(content, ground.sessions, sinks=sinks, failures=ground.failures)
     assert content["recordings"] == [str(ground.path)]
     assert content["recording_bytes"] == ground.path.stat().st_size
     (failed,) = content["failed"]
     assert (failed["part"], failed["working"]) == ("second recording of uav-1", False)
     assert "does not exist" in failed["reason"]
-    assert content["missing_events"] == {
-        part: content["missing_events"][part] for part in ("second recording of uav-1", "recording of uav-10")
-    }
+    assert content["missing_events"].keys() == {"second recording of uav-1", "recording of uav-10"}
     assert unexplained(content) == set(), "who reads the JSON would look them up in the source"
     rows = [text for name, text in table(content) if name in ("failed", "missing")]
     assert any("second recording of uav-1" in row and "did not work again" in row for row in rows)
@@ -260,9 +262,8 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
     session = ground.opened[0]
     crossed, window_s = session.reception.ledger.line_bytes, session.info.window_ns / SECOND_NS
     assert edge.session.duration_s < window_s
-    assert edge.session.mean_bps == pytest.approx(8 * crossed / window_s, abs=1), (
-        "986 kbps of a budget of 800"
-    )
+    mean_bps = pytest.approx(8 * crossed / window_s, abs=1)
+    assert edge.session.mean_bps == mean_bps, "986 kbps of a budget of 800"
     assert edge.session.edge_frames_dropped == 0
     assert edge.session.pose is None
     since_ns = edge.link_since_ns
@@ -275,14 +276,12 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
 
 def test_an_edge_that_leaves_frames_out_is_on_a_thin_link(ground):
     """Frames that the link did not carry, the budget left out, or a slow machine missed want different remedies."""
-    flight, now_ns = ground.port.flight, [time.time_ns()]
+    now_ns = [time.time_ns()]
     maker = StateMaker(lambda: now_ns[0])
 
     def link_after(sequence: int, **groups: int) -> str:
-        item = flight.status(base=5)
-        report = Status.parse(item.payload)
-        report = replace(report, sequence=sequence, frames=FrameAccount(groups).as_counts())
-        ground.sessions.handle(replace(item, payload=report.pack()))
+        counts = FrameAccount(groups).as_counts()
+        ground.report(lambda status: replace(status, sequence=sequence, frames=counts))
         now_ns[0] += 10**9
         return maker.make([("uav-1", ground.sessions)]).edges[0].link
 
@@ -302,36 +301,27 @@ def test_a_state_can_be_written_as_json(ground):
 
 def test_a_part_of_the_edge_fails_since_it_stopped(ground):
     """A camera that is gone for a minute would be gone "since two seconds": each try is a new failure."""
-    item, at_ns = ground.port.flight.status(base=5), 1_790_000_000 * SECOND_NS
+    at_ns, reception = 1_790_000_000 * SECOND_NS, ground.sessions.session.reception
     for number, working in enumerate((False, False, True, False, False)):
         tried_ns = at_ns + number * SECOND_NS
         source = FailedPart(part="source", reason="gone", failures=1, failed_ns=tried_ns, working=working)
-        report = replace(Status.parse(item.payload), sequence=9 + number, failed=(source,))
-        ground.sessions.handle(replace(item, payload=report.pack()))
+        ground.report(lambda status, n=number, one=source: replace(status, sequence=9 + n, failed=(one,)))
         if number == 1:
-            assert ground.sessions.session.reception.edge_failing == {"source": at_ns}
-    assert ground.sessions.session.reception.edge_failing == {"source": at_ns + 3 * SECOND_NS}
-    session = ground.sessions.session
-    (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
-    assert edge.session.edge_failed[0].since_ns == session.reception.clock_offset.to_local_ns(
-        at_ns + 3 * SECOND_NS
-    )
+            assert reception.edge_failing == {"source": at_ns}
+    stopped_ns = at_ns + 3 * SECOND_NS
+    assert reception.edge_failing == {"source": stopped_ns}
+    (edge,) = ground.state().edges
+    assert edge.session.edge_failed[0].since_ns == reception.clock_offset.to_local_ns(stopped_ns)
 
 
 def test_words_of_an_edge_do_not_become_series_without_end(ground):
     """Each new reason or part that a hostile edge names would stay in the database of whoever watches."""
-    item = ground.port.flight.status(base=5)
     evil = FailedPart(part="evil", reason="x", failures=1, failed_ns=1, working=False)
-    said = replace(
-        Status.parse(item.payload),
-        sequence=9,
-        deferred={f"evil {n}": 1 for n in range(20)} | {"base_good": 5},
-        failed=(evil, replace(evil, part="evil 2"), replace(evil, part="encoder")),
-    )
-    ground.sessions.handle(replace(item, payload=said.pack()))
-    text = metrics_text(ground.maker.make([("uav-1", ground.sessions)])).decode()
-    ground.sessions.close()
-    ground.outputs.close()
+    deferred = {f"evil {n}": 1 for n in range(20)} | {"base_good": 5}
+    failed = (evil, replace(evil, part="evil 2"), replace(evil, part="encoder"))
+    ground.report(lambda status: replace(status, sequence=9, deferred=deferred, failed=failed))
+    text = ground.metrics()
+    ground.end()
     assert "evil" not in text
     for line in (
         'hvt_stills_not_sent_total{edge="uav-1",reason="other"} 20.0',
@@ -350,33 +340,27 @@ def test_what_was_is_not_said_to_be_now(tmp_path):
         ground.sessions.handle(flight.base(index))
 
     def report() -> None:
-        item = flight.status(base=5)
-        said = Status.parse(item.payload)
-        said = replace(said, health=replace(said.health, encode_ms=4.0))
-        ground.sessions.handle(replace(item, payload=said.pack()))
-
-    report()
+        ground.report(lambda status: replace(status, health=replace(status.health, encode_ms=4.0)))
 
     def state() -> SessionState:
-        return ground.maker.make([("uav-1", ground.sessions)]).edges[0].session
+        return ground.state().edges[0].session
 
+    report()
     first = state()
-    now = (first.total_bps, first.budget_share, first.base_bps, first.roi_bps, first.tracks_doubted)
-    assert None not in (*now, first.edge_encode_ms)
+    of_now = attrgetter("total_bps", "budget_share", "base_bps", "roi_bps", "tracks_doubted")
+    assert None not in (*of_now(first), first.edge_encode_ms)
     assert first.edge_detect_ms is None, "nothing was detected there: 0 is not how long it took"
     now_ns += 4 * SECOND_NS
     report()
     gone = state()
-    stale = (gone.total_bps, gone.budget_share, gone.base_bps, gone.roi_bps, gone.tracks_doubted)
-    assert {*stale, gone.delay_p50_ms, gone.delay_p95_ms} == {None}
+    assert {*of_now(gone), gone.delay_p50_ms, gone.delay_p95_ms} == {None}
     assert gone.edge_encode_ms == 4.0, "its report is of now"
     assert "NO PICTURE for" in ground.line()
     now_ns += 4 * SECOND_NS
     silent = state()
     assert (silent.edge_encode_ms, silent.edge_still_queue) == (None, None)
     assert silent.edge_frames_dropped is not None, "what is counted stays"
-    text = metrics_text(ground.maker.make([("uav-1", ground.sessions)])).decode()
+    text = ground.metrics()
     for name in ("hvt_received_bits_per_second", "hvt_edge_encode_seconds", "hvt_overlay_delay_p95_seconds"):
         assert f'{name}{{edge="uav-1"}}' not in text
-    ground.sessions.close()
-    ground.outputs.close()
+    ground.end()
