@@ -169,8 +169,9 @@ class BacklogRecording:
         """Log the amount received and close the file, without waiting for it."""
         totals = self.backlog.totals
         if totals.first is not None and totals.amount():
-            text = f"{totals.amount()} of this session arrived after it had ended"
-            self.sink.log(Notice(*totals.first, "info", text))
+            self.sink.log(
+                Notice(*totals.first, "info", f"{totals.amount()} of this session arrived after it had ended")
+            )
         self.sink.close()
 
     def _emit(self, event: Event) -> None:
