@@ -13,7 +13,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
 from hvt_common import __version__
 from hvt_common.errors import telling
@@ -80,7 +80,9 @@ def _one_try(url: str, part: Path, *, size_bytes: int, progress: Progress) -> No
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as response:  # noqa: S310
             start = _start_of(url, response, offset=offset, size_bytes=size_bytes)
-            with _opened(part, start) as file:
+            with telling(f"{part} cannot be written (", "): free space, or set HVT_MODELS"):
+                file = part.open("ab" if start else "wb")
+            with file:
                 _copy(response, file, start=start, size_bytes=size_bytes, progress=progress)
     except urllib.error.HTTPError as error:
         _answer_failed(url, part, error, offset=offset)
@@ -118,11 +120,6 @@ def _start_of(url: str, response: http.client.HTTPResponse, *, offset: int, size
     if total != size_bytes:
         raise DownloadError(f"{url} has {total} bytes, not the {size_bytes} that are pinned")
     return start
-
-
-def _opened(part: Path, start: int) -> BinaryIO:
-    with telling(f"{part} cannot be written (", "): free space, or set HVT_MODELS"):
-        return cast("BinaryIO", part.open("ab" if start else "wb"))
 
 
 def _copy(

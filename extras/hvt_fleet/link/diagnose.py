@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Self
 
 import zenoh
@@ -244,9 +244,13 @@ class Watch(LinkWatch):
                 continue
             since_s = self._first_seen_s.setdefault(name, now_s)
             if not self.rights.knows(name):
-                self._say(name, self._stranger(name))
+                sentence = self._stranger(name)
             elif now_s - since_s > self._patience_s and not router and self._is_hiding(name):
-                self._say(name, self._hidden(name))
+                sentence = self._hidden(name)
+            else:
+                continue
+            self._named.add(name)
+            _log.warning("%s", sentence)
 
     def _is_hiding(self, name: str) -> bool:
         if self._edge is None and not self._writes(name):
@@ -279,10 +283,6 @@ class Watch(LinkWatch):
             "than its certificate says, and all it sends is dropped"
         )
 
-    def _say(self, name: str, sentence: str) -> None:
-        self._named.add(name)
-        _log.warning("%s", sentence)
-
 
 def visit(config: zenoh.Config) -> list[str]:
     """One sentence for each endpoint that this configuration connects to. Blocks for some seconds an endpoint."""
@@ -298,21 +298,10 @@ def visit(config: zenoh.Config) -> list[str]:
 class Doctor(LinkDoctor):
     """The one of this extra."""
 
-    def check_keys(
-        self, config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float
-    ) -> None:
-        check_own_keys(config, listen=listen, name=name, now_s=now_s)
-
-    def check_id(self, settings: LinkSettings, keys: EdgeKeys) -> None:
-        refuse_duplicate_edge(settings, keys)
-
-    def why_no_link(self, config: zenoh.Config) -> list[str]:
-        return visit(config)
-
-    def watch(
-        self, session: zenoh.Session, settings: LinkSettings, *, served: Callable[[str], bool]
-    ) -> LinkWatch:
-        return Watch(session, settings, served=served)
+    check_keys = staticmethod(check_own_keys)
+    check_id = staticmethod(refuse_duplicate_edge)
+    why_no_link = staticmethod(visit)
+    watch = staticmethod(Watch)
 
 
 def _connected_twice(config: zenoh.Config) -> set[str]:

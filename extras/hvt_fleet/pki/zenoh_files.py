@@ -146,22 +146,10 @@ def _rule(name: str, flow: str, messages: Sequence[str], key_exprs: Sequence[str
 
 
 _GROUP_MESSAGES = (
-    "liveliness_token",
-    "declare_liveliness_subscriber",
-    "liveliness_query",
-    "declare_queryable",
-    "query",
-    "reply",
+    *("liveliness_token", "declare_liveliness_subscriber", "liveliness_query"),
+    *("declare_queryable", "query", "reply"),
 )
-_AMONG_GROUNDS: list[_Rule] = [
-    _rule(
-        f"groups-{flow}",
-        flow,
-        _GROUP_MESSAGES,
-        [_GROUPS],
-    )
-    for flow in ("ingress", "egress")
-]
+_AMONG_GROUNDS = [_rule(f"groups-{flow}", flow, _GROUP_MESSAGES, [_GROUPS]) for flow in ("ingress", "egress")]
 """Messages between grounds of a group, by way of routers too; no edge receives or sends them."""
 
 

@@ -9,12 +9,12 @@ those here know different views, and the surest of a cluster counts (docs/embedd
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.class_names import group_of, kind_of
+from hvt_common.inference.detect import Detector
 from hvt_common.inference.nms import MAX_DETECTIONS
 from hvt_common.values import Detections, Image
 
@@ -37,7 +37,7 @@ def on_scale_of(confidences: npt.NDArray[np.float32], own: float, wanted: float)
 
 
 def open_ensemble(
-    opened: Callable[[str, float], _Part], owns: Mapping[str, float], *, confidence: float
+    opened: Callable[[str, float], Detector], owns: Mapping[str, float], *, confidence: float
 ) -> EnsembleDetector:
     """The ensemble of the parts that ``owns`` names, with their confidences of use.
 
@@ -48,13 +48,6 @@ def open_ensemble(
     return EnsembleDetector(parts, list(owns.values()), confidence=confidence)
 
 
-class _Part(Protocol):
-    @property
-    def class_names(self) -> tuple[str, ...]: ...
-
-    def detect(self, image_bgr: Image) -> Detections: ...
-
-
 class EnsembleDetector:
     """Two or three detectors, itself one; ``owns`` are their confidences of use, the first the ensemble's.
 
@@ -62,7 +55,7 @@ class EnsembleDetector:
     least of a detection.
     """
 
-    def __init__(self, parts: Sequence[_Part], owns: Sequence[float], *, confidence: float) -> None:
+    def __init__(self, parts: Sequence[Detector], owns: Sequence[float], *, confidence: float) -> None:
         self._parts, self._owns, self._confidence = tuple(parts), tuple(owns), confidence
         names: list[str] = list(parts[0].class_names)
         kinds = [kind_of(name) for name in names]

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from hvt_edge.loop.pose import open_pose
 from programs.processes import PATIENT_S
 
 
@@ -72,6 +73,21 @@ def autopilot():
 
 
 @pytest.fixture
+def now() -> list[float]:
+    """The clock, in seconds; it stands: what was said once is not old, however long this machine takes to look."""
+    return [1000.0]
+
+
+@pytest.fixture
+def source(port: int, now: list[float]) -> Iterator:
+    """What listens."""
+    clock = lambda: round(now[0] * 1_000_000_000)  # noqa: E731
+    opened = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=65.0, clock=clock)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
 def port() -> int:
     """Of UDP, a free one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
@@ -95,14 +111,12 @@ def send(port: int) -> Iterator:
 def wait_for():
     """Wait for the pose to be as wanted, repeating what is to be said meanwhile."""
 
-    def wait_for(
-        source, *, accept=lambda pose: pose is not None, say=lambda: None, limit_s: float = PATIENT_S
-    ):
+    def wait_for(source, *, has="latitude_deg", accept=None, say=lambda: None, limit_s: float = PATIENT_S):
         until = time.monotonic() + limit_s
         while time.monotonic() < until:
             say()
             pose = source.at(0, capture_ns=11)
-            if accept(pose):
+            if getattr(pose, has, None) is not None if accept is None else accept(pose):
                 return pose
             time.sleep(0.02)
         raise AssertionError(f"no such pose came: {source.trouble}")

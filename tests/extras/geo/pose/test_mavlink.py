@@ -11,27 +11,6 @@ import pytest
 
 pytest.importorskip("pymavlink")
 
-from hvt_edge.loop.pose import open_pose
-
-
-@pytest.fixture
-def source(port):
-    """What listens. Its clock stands: what was said once is not old, however long this machine takes to look."""
-    now_ns = time.time_ns()
-    opened = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=65.0, clock=lambda: now_ns)
-    yield opened
-    opened.close()
-
-
-def has_camera(pose) -> bool:
-    """Whether it says where the camera points."""
-    return pose is not None and pose.camera is not None
-
-
-def has_platform(pose) -> bool:
-    """Whether it says where the vehicle points."""
-    return pose is not None and pose.platform is not None
-
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_place_and_attitude_come_from_the_autopilot(source, send, autopilot, wait_for, version):
@@ -40,7 +19,7 @@ def test_place_and_attitude_come_from_the_autopilot(source, send, autopilot, wai
     assert "no position" in source.trouble
     one = autopilot(version=version)
     send(one.place(), one.attitude())
-    pose = wait_for(source, accept=has_platform)
+    pose = wait_for(source, has="platform")
     assert (pose.latitude_deg, pose.longitude_deg) == pytest.approx((47.1, 8.5))
     assert (pose.height_m, pose.altitude_m, pose.hfov_deg, pose.capture_ns) == (120.0, 550.0, 65.0, 11)
     assert (pose.platform.yaw_deg, pose.platform.pitch_deg, pose.platform.roll_deg) == pytest.approx(
@@ -82,7 +61,7 @@ def test_the_gimbal_says_which_way_its_yaw_counts(source, send, autopilot, wait_
     """Everything would be placed beside where it is, by the angle at which the drone flies."""
     one = autopilot()
     send(one.place(), one.attitude(50), one.gimbal(90, -30, flags=flags))
-    pose = wait_for(source, accept=has_camera)
+    pose = wait_for(source, has="camera")
     assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((yaw, -30), abs=0.01)
 
 
@@ -92,7 +71,7 @@ def test_the_mount_speaks_where_no_gimbal_knows_better(source, send, autopilot, 
     one = autopilot()
     unsure = [one.gimbal(math.nan, -30, flags=32)] * gimbals
     send(one.place(), one.attitude(50), *unsure, one.mount())
-    pose = wait_for(source, accept=has_camera)
+    pose = wait_for(source, has="camera")
     assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((60, -60), abs=0.01)
 
 
@@ -103,7 +82,7 @@ def test_an_old_device_that_speaks_first_hides_nothing(source, send, autopilot, 
     one = autopilot()
     pose = wait_for(
         source,
-        accept=has_camera,
+        has="camera",
         say=lambda: send(one.place(), one.attitude(), one.gimbal(90, -30, flags=64)),
     )
     assert pose.camera.yaw_deg == pytest.approx(90, abs=0.01)
@@ -139,30 +118,22 @@ def test_a_flood_leaves_no_queue_behind(source, send, autopilot, wait_for):
     assert wait_for(source, say=lambda: send(autopilot().place())).latitude_deg == pytest.approx(47.1)
 
 
-def test_it_sends_the_autopilot_nothing(port, autopilot, wait_for):
+def test_it_sends_the_autopilot_nothing(source, port, autopilot, wait_for):
     """What is only to watch would take part in the control of a vehicle."""
-    source = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=None, clock=time.time_ns)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
-        try:
-            one.sendto(autopilot().heartbeat() + autopilot().place(), ("127.0.0.1", port))
-            wait_for(source)
-        finally:
-            source.close()
+        one.sendto(autopilot().heartbeat() + autopilot().place(), ("127.0.0.1", port))
+        wait_for(source)
+        source.close()
         one.settimeout(0.2)
         with pytest.raises(TimeoutError):
             one.recv(1)
 
 
-def test_what_an_autopilot_said_long_ago_is_no_pose(port, send, autopilot, wait_for):
+def test_what_an_autopilot_said_long_ago_is_no_pose(source, now, send, autopilot, wait_for):
     """A lost autopilot would leave the camera hanging where it was."""
-    now = [time.time_ns()]
-    source = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=None, clock=lambda: now[0])
-    try:
-        send(autopilot().place())
-        wait_for(source)
-        now[0] += 3_000_000_000
-        assert source.at(0, capture_ns=0) is None
-        assert "3 s old" in source.trouble
-    finally:
-        source.close()
+    send(autopilot().place())
+    wait_for(source)
+    now[0] += 3
+    assert source.at(0, capture_ns=0) is None
+    assert "3 s old" in source.trouble

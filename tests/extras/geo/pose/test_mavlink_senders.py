@@ -8,25 +8,8 @@ import pytest
 
 pytest.importorskip("pymavlink")
 
-from hvt_edge.loop.pose import open_pose
 from hvt_geo.pose.angles import euler_deg
 from hvt_geo.pose.mavlink_transport import FrameParser
-
-
-@pytest.fixture
-def now():
-    """The clock, in seconds."""
-    return [1000.0]
-
-
-@pytest.fixture
-def source(port, now):
-    """What listens."""
-    opened = open_pose(
-        f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=65.0, clock=lambda: round(now[0] * 1_000_000_000)
-    )
-    yield opened
-    opened.close()
 
 
 def test_a_gimbals_own_attitude_is_not_the_aircrafts(source, send, wait_for, autopilot):
@@ -37,13 +20,12 @@ def test_a_gimbals_own_attitude_is_not_the_aircrafts(source, send, wait_for, aut
         send(own.place(), own.attitude(50.0), gimbal.attitude(110.0))
         send(own.say("mount_orientation", 1000, 0.0, -45.0, 30.0, 0.0))
 
-    pose = wait_for(source, accept=lambda one: one is not None and one.camera is not None, say=say)
+    wait_for(source, has="camera", say=say)
     for _ in range(5):
         say()
         time.sleep(0.05)
         pose = source.at(0, capture_ns=0)
-        assert pose.platform.yaw_deg == pytest.approx(50, abs=0.01)
-        assert pose.camera.yaw_deg == pytest.approx(80, abs=0.01)
+        assert (pose.platform.yaw_deg, pose.camera.yaw_deg) == pytest.approx((50, 80), abs=0.01)
 
 
 def test_there_is_no_place_before_the_fix(source, send, wait_for, autopilot):
@@ -70,17 +52,14 @@ def test_a_place_beyond_the_earth_is_none(source, send, wait_for, autopilot):
     )
 
 
-def test_a_turn_alone_is_an_attitude(source, send, wait_for, autopilot):
-    """The camera's direction from the vehicle would count for nothing."""
-    one = autopilot()
-
-    def say():
-        half = 0.5**0.5
-        send(one.place(), one.say("attitude_quaternion", 1000, half, 0.0, 0.0, half, 0, 0, 0))
-        send(one.old_mount())
-
-    pose = wait_for(source, accept=lambda one: one is not None and one.camera is not None, say=say)
-    assert pose.camera.yaw_deg == pytest.approx(120.0)
+@pytest.mark.parametrize("attitude", ["angles", "quaternion"])
+def test_an_old_mount_points_the_camera_by_any_attitude(source, send, wait_for, autopilot, attitude):
+    """Nothing would be placed, and nobody said why."""
+    one, half = autopilot(), 0.5**0.5
+    turned = one.say("attitude_quaternion", 1000, half, 0.0, 0.0, half, 0, 0, 0)
+    own = one.attitude(90.0) if attitude == "angles" else turned
+    pose = wait_for(source, has="camera", say=lambda: send(one.place(), own, one.old_mount()))
+    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((120, -45), abs=0.01)
 
 
 def test_a_place_near_0_0_is_none_where_nobody_says_a_fix(source, send, wait_for, autopilot):
@@ -111,17 +90,6 @@ def test_another_vehicle_counts_once_the_first_is_gone(source, send, wait_for, n
 
     there = lambda pose: pose is not None and pose.latitude_deg == pytest.approx(48.0)  # noqa: E731
     wait_for(source, accept=there, say=goes_on)
-
-
-def test_an_old_mount_points_the_camera(source, send, wait_for, autopilot):
-    """Nothing would be placed, and nobody said why."""
-    one = autopilot()
-    pose = wait_for(
-        source,
-        accept=lambda pose: pose is not None and pose.camera is not None,
-        say=lambda: send(one.place(), one.attitude(50.0), one.old_mount()),
-    )
-    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((80, -45), abs=0.01)
 
 
 def test_that_nobody_says_where_the_camera_points_is_told_of_once(
