@@ -32,13 +32,24 @@ _REST_NS = 2 * SECOND_NS
 _MOST_BPS = 1_000_000_000
 _LEAST_CAMERA_BPS = 10_000
 """With less the frame loop would only wait for ``status``."""
-_QUALITIES_PCT = (5, 95)
-_MOST_AGO_MS = 3_600_000
 _U32 = 2**32 - 1
 _FAR_PX = 32767
 _REASON_BYTES = 200
 
-Arguments = Mapping[str, int | float | str]
+Arguments = Mapping[str, Any]
+_ARGUMENTS: Mapping[str, Mapping[str, tuple[int, int] | None]] = {
+    Command.STILL: {
+        "track": (0, _U32),
+        "frame": (0, _U32),
+        "at_ms": (-3_600_000, 0),
+        "quality": (5, 95),
+        **dict.fromkeys("xywh", (-_FAR_PX, _FAR_PX)),
+    },
+    Command.STILL_OUTCOME: {"ask": (0, _U32)},
+    Command.SET_BUDGET: {"bps": (1, _MOST_BPS)},
+    Command.SET_METHOD: {"method": None},
+}
+"""Bounds of whole numbers; None is a word. All but those of a still are needed."""
 
 
 @dataclass(eq=False)
@@ -110,6 +121,7 @@ class Commands:
         command = self._commands.get(request.command)
         if command is None:
             raise RefusedError(f"this edge does not serve {request.command!r}")
+        _check_arguments(request.command, request.arguments)
         return command(request.arguments)
 
     def _check_rate(self) -> None:
@@ -120,8 +132,7 @@ class Commands:
 
     # The commands
 
-    def _keyframe(self, arguments: Arguments) -> ControlAnswer:
-        _Reader("keyframe", arguments).end()
+    def _keyframe(self, _arguments: Arguments) -> ControlAnswer:
         refusal = self.keyframes.request(self.loop_clock())
         if refusal is not None:
             raise RefusedError(refusal)
@@ -132,13 +143,9 @@ class Commands:
         return self._answer(still_request=number, frame_index=frame_index)
 
     def _still_outcome(self, arguments: Arguments) -> ControlAnswer:
-        reader = _Reader("still-outcome", arguments)
-        number = reader.needed("ask", 0, _U32)
-        reader.end()
-        return self._answer(note=self.chooser.on_demand.outcome(number))
+        return self._answer(note=self.chooser.on_demand.outcome(arguments["ask"]))
 
-    def _tracks(self, arguments: Arguments) -> ControlAnswer:
-        _Reader("tracks", arguments).end()
+    def _tracks(self, _arguments: Arguments) -> ControlAnswer:
         frame_index, tracks, there = self.chooser.on_demand.tracks()
         note = (
             f"of {there} tracks these are the {len(tracks)} of most confidence" if there > len(tracks) else ""
@@ -146,19 +153,13 @@ class Commands:
         return self._answer(frame_index=frame_index, tracks=tracks, note=note)
 
     def _set_budget(self, arguments: Arguments) -> ControlAnswer:
-        reader = _Reader("set-budget", arguments)
-        bps = reader.needed("bps", 1, _MOST_BPS)
-        reader.end()
         now = self.operating.now
-        self._change(bps, now.video_share, now.method)
+        self._change(arguments["bps"], now.video_share, now.method)
         return self._answer()
 
     def _set_method(self, arguments: Arguments) -> ControlAnswer:
-        reader = _Reader("set-method", arguments)
-        name = reader.text("method")
-        reader.end()
         now = self.operating.now
-        before, policy = method(now.method), self.make_method(name)
+        before, policy = method(now.method), self.make_method(arguments["method"])
         if policy.name == before.name:
             return self._answer()
         if "R0" in (policy.name, before.name):
@@ -169,8 +170,7 @@ class Commands:
         self.chooser.method = policy  # from the next decision step on; pending stills stay
         return self._answer()
 
-    def _send_backlog(self, arguments: Arguments) -> ControlAnswer:
-        _Reader("send-backlog", arguments).end()
+    def _send_backlog(self, _arguments: Arguments) -> ControlAnswer:
         if self.backlog is None:
             raise RefusedError("this edge stores nothing while its link is away (--store 0)")
         if not self.backlog.send_video():
@@ -214,14 +214,8 @@ class Commands:
 
 
 def _on_demand_request(arguments: Arguments) -> OnDemandRequest:
-    reader = _Reader("still", arguments)
-    track = reader.optional("track", 0, _U32)
-    box = [reader.optional(name, -_FAR_PX, _FAR_PX) for name in ("x", "y", "w", "h")]
-    at_ms = reader.optional("at_ms", -_MOST_AGO_MS, 0)
-    frame = reader.optional("frame", 0, _U32)
-    quality_pct = reader.optional("quality", *_QUALITIES_PCT)
-    reader.end()
-    given = [side for side in box if side is not None]
+    track, frame, at_ms = (arguments.get(name) for name in ("track", "frame", "at_ms"))
+    given = [arguments[side] for side in "xywh" if side in arguments]
     if len(given) not in (0, 4):
         raise RefusedError("a box takes x, y, w and h, all four")
     if track is not None and given:
@@ -233,40 +227,22 @@ def _on_demand_request(arguments: Arguments) -> OnDemandRequest:
         box_xywh_px=(given[0], given[1], given[2], given[3]) if given else None,
         frame_index=frame,
         ago_ms=None if at_ms is None else -at_ms,
-        quality_pct=quality_pct,
+        quality_pct=arguments.get("quality"),
     )
 
 
-class _Reader:
-    # Takes a command's arguments one by one; any that remains is refused.
-
-    def __init__(self, command: str, arguments: Arguments) -> None:
-        self._command = command
-        self._left: dict[str, Any] = dict(arguments)
-
-    def optional(self, name: str, low: int, high: int) -> int | None:
-        """A whole number within the bounds; None where it is not given."""
-        value = self._left.pop(name, None)
-        if value is None:
-            return None
-        if type(value) is not int or not low <= value <= high:
+def _check_arguments(command: str, arguments: Arguments) -> None:
+    taken = _ARGUMENTS.get(command, {})
+    for name, value in arguments.items():
+        if name not in taken:
+            raise RefusedError(f"{command} takes no {name!r:.24}")
+        bounds = taken[name]
+        if bounds is None and not isinstance(value, str):
+            raise RefusedError(f"{command}: {name} is a word, not {value!r:.24}")
+        if bounds is not None and (type(value) is not int or not bounds[0] <= value <= bounds[1]):
             raise RefusedError(
-                f"{self._command}: {name} is a whole number from {low} to {high}, not {value!r:.24}"
+                f"{command}: {name} is a whole number from {bounds[0]} to {bounds[1]}, not {value!r:.24}"
             )
-        return value
-
-    def needed(self, name: str, low: int, high: int) -> int:
-        value = self.optional(name, low, high)
-        if value is None:
-            raise RefusedError(f"{self._command}: {name} is missing")
-        return value
-
-    def text(self, name: str) -> str:
-        value = self._left.pop(name, None)
-        if not isinstance(value, str):
-            raise RefusedError(f"{self._command}: {name} is missing, or not a word")
-        return value
-
-    def end(self) -> None:
-        if self._left:
-            raise RefusedError(f"{self._command} takes no {next(iter(self._left))!r:.24}")
+    missing = [] if command == Command.STILL else [name for name in taken if name not in arguments]
+    if missing:
+        raise RefusedError(f"{command}: {missing[0]} is missing")

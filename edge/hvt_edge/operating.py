@@ -21,7 +21,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 from hvt_common.runtime.statistics import Newest
@@ -127,31 +127,29 @@ class Operating:
             self._point = replace(self._point, **changes)  # type: ignore[arg-type]
 
 
+@dataclass(eq=False)
 class LoopClock:
     """The time of the budget's windows: the wall clock, or in lockstep the newest frame's capture time.
 
     ``wait(seconds)`` sleeps; in lockstep nothing is waited for.
     """
 
-    def __init__(
-        self, clock: Callable[[], int], *, lockstep: bool, wait: Callable[[float], object] = time.sleep
-    ) -> None:
-        self._clock = clock
-        self._lockstep = lockstep
-        self._wait = wait
-        self._media_ns = 0
+    clock: Callable[[], int]
+    _: KW_ONLY
+    lockstep: bool
+    wait: Callable[[float], object] = time.sleep
+    _media_ns: int = 0
 
     def __call__(self) -> int:
-        return self._media_ns if self._lockstep else self._clock()
+        return self._media_ns if self.lockstep else self.clock()
 
     def advance(self, capture_ns: int) -> None:
-        """Note that the loop has come to this frame."""
         self._media_ns = capture_ns
 
     def wait_until(self, at_ns: int) -> None:
         """Sleep until the time at which the budget's window has room."""
-        if not self._lockstep and (wait_ns := at_ns - self._clock()) > 0:
-            self._wait(wait_ns / SECOND_NS)
+        if not self.lockstep and (wait_ns := at_ns - self.clock()) > 0:
+            self.wait(wait_ns / SECOND_NS)
 
     def pause(self, pause_ns: int) -> int:
         """Sleep for ``pause_ns``; return the time after it."""
@@ -212,7 +210,6 @@ class Keyframes:
         self._lossy = False
         """Whether a receiver has lost more since the last keyframe."""
         self.sent = 0
-        """Keyframes so far."""
         self.served = 0
         """Requests of grounds that were met by a keyframe of their own, or one that was due or fresh."""
 

@@ -6,10 +6,11 @@ import itertools
 import threading
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -18,7 +19,7 @@ from hvt_common.inference.detect import Detector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Status
 from hvt_common.runtime.reporting import reported
-from hvt_common.values import Detections, Frame, Image
+from hvt_common.values import Detections, Frame
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.link.publisher import EdgeLink
@@ -32,136 +33,15 @@ pytestmark = pytest.mark.integration
 FPS, READING_S, FRAMES = 15.0, 0.5, 8
 
 
-class SlowWorld(World):
-    """With such a source."""
+class Staged(World):
+    """Calls ``before`` with each frame of its source; keeps its status messages, and counts opened detectors."""
 
-    def open_source(self, config: EdgeConfig) -> Source:
-        """See there."""
-        return PassedOn(super().open_source(config), before=lambda _frame: time.sleep(READING_S))
-
-
-def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path):
-    """The summary would tell of rates that never were."""
-    write_scene(tmp_path, frames=FRAMES)
-    config = EdgeConfig(
-        source=str(tmp_path), source_fps=FPS, fps=FPS, size="320x192", preset="ultrafast", method="M0",
-        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0,
-    )  # fmt: skip
-    began_s = time.monotonic()
-    summary = Edge(check(config), stop=threading.Event(), world=SlowWorld()).run()
-    took_s = time.monotonic() - began_s
-    assert FRAMES * (READING_S - 1 / FPS) - 1.5 <= summary["clip_paused_s"] <= took_s
-    assert FRAMES * READING_S - 2 <= summary["duration_s"] <= took_s
-    assert summary["frames_captured"] == FRAMES
-
-
-def _threads() -> set[threading.Thread]:
-    return set(threading.enumerate())
-
-
-def test_an_edge_that_hangs_is_reported(tmp_path):
-    """All that was counted would be lost with it, and the reason; and a small board has no memory for threads."""
-    write_scene(tmp_path, frames=FRAMES)
-    config = EdgeConfig(
-        source=str(tmp_path), source_fps=FPS, fps=FPS, size="320x192", preset="ultrafast", method="M0",
-        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0,
-    )  # fmt: skip
-    hung, goes_on = threading.Event(), threading.Event()
-
-    class HangingWorld(World):
-        def open_source(self, config: EdgeConfig) -> Source:
-            def before(frame: Frame) -> None:
-                if frame.index == 3:
-                    hung.set()
-                    goes_on.wait()
-
-            return PassedOn(super().open_source(config), before=before)
-
-    edge = Edge(check(config), stop=threading.Event(), world=HangingWorld())
-    assert edge.given_up().summary is None, "nothing is known yet"
-    run, before = threading.Thread(target=edge.run), _threads()
-    run.start()
-    try:
-        assert hung.wait(60)
-        names = {one.name for one in _threads() - before - {run}}
-        assert {one for one in names if one.startswith("hvt-")} <= {
-            "hvt-link-watch",
-            "hvt-sockets",
-            "hvt-stills",
-        }
-        assert len(names) <= 6, "and one of Zenoh's for each channel that it answers on"
-        summary = edge.given_up().summary
-    finally:
-        goes_on.set()
-        run.join()
-    assert summary["frames_captured"] == 3
-    assert "hangs" in next(one["reason"] for one in summary["failed"] if one["part"] == "flight")
-
-
-class CountingWorld(World):
-    """Notes each detector that is opened."""
-
-    def __init__(self) -> None:
+    def __init__(self, before: Callable[[Frame], None] = lambda _frame: None) -> None:
         super().__init__()
-        self.opened = 0
-
-    def open_detector(self, config: EdgeConfig) -> Detector:
-        """See there."""
-        self.opened += 1
-        return super().open_detector(config)
-
-
-@pytest.mark.parametrize(
-    ("settings", "opened", "pace"),
-    [
-        ({}, 0, "lockstep"),
-        ({}, 0, "realtime"),
-        ({"send_tracks": True}, 1, "realtime"),
-        ({"method": "M2"}, 1, "lockstep"),
-    ],
-)
-def test_video_alone_opens_no_detector(tmp_path, pace, settings, opened):
-    """A third of the processor would go to tracks that nobody is sent."""
-    write_scene(tmp_path, frames=10)
-    config = EdgeConfig(
-        source=str(tmp_path),
-        source_fps=10.0,
-        fps=10,
-        size="320x192",
-        preset="ultrafast",
-        connect=("tcp/127.0.0.1:9",),
-        wait=0.0,
-        quiet=True,
-        store=0,
-        pace=pace,
-        **({"method": "M0"} | settings),
-    )
-    world = CountingWorld()
-    summary = Edge(check(config), stop=threading.Event(), world=world).run()
-    assert world.opened == opened
-    assert summary["frames"] > 0
-    assert not summary.get("failed")
-
-
-def test_a_wrong_endpoint_is_refused_before_a_model_is_opened(tmp_path):
-    """A board opens its models for half a minute, and then said what was wrong with the command."""
-    write_scene(tmp_path, frames=1)
-    config = EdgeConfig(source=str(tmp_path), source_fps=1.0, connect=("tcp/127.0.0.1",), method="M2")
-    world = CountingWorld()
-    with pytest.raises(UserError, match="is not usable: PROTOCOL"):
-        Edge(check(config), stop=threading.Event(), world=world).run()
-    assert world.opened == 0
-
-
-class TornWorld(World):
-    """Its source breaks off; ``reports`` are its status messages."""
-
-    def __init__(self) -> None:
-        super().__init__()
+        self.before, self.opened = before, 0
         self.reports: list[Status] = []
 
     def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
-        """See there."""
         link = super().open_link(stack, config)
         put = link.put
 
@@ -174,27 +54,94 @@ class TornWorld(World):
         return link
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """See there."""
+        return PassedOn(super().open_source(config), before=self.before)
 
-        def before(frame: Frame) -> None:
-            if frame.index == 6:
-                raise UserError("it is torn")
+    def open_detector(self, config: EdgeConfig) -> Detector:
+        self.opened += 1
+        return super().open_detector(config)
 
-        return PassedOn(super().open_source(config), before=before)
+
+def edge(folder, world: World, *, frames: int = FRAMES, stop=None, **settings: Any) -> Edge:
+    """An edge of so many pictures, to which nobody listens."""
+    write_scene(folder, frames=frames)
+    plain = {"source_fps": FPS, "fps": FPS, "size": "320x192", "preset": "ultrafast", "method": "M0"}
+    plain |= {"connect": ("tcp/127.0.0.1:9",), "wait": 0.0, "quiet": True, "store": 0}
+    config = check(EdgeConfig(source=str(folder), **(plain | settings)))
+    return Edge(config, stop=stop or threading.Event(), world=world)
+
+
+def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path):
+    """The summary would tell of rates that never were."""
+    began_s = time.monotonic()
+    summary = edge(tmp_path, Staged(lambda _frame: time.sleep(READING_S))).run()
+    took_s = time.monotonic() - began_s
+    assert FRAMES * (READING_S - 1 / FPS) - 1.5 <= summary["clip_paused_s"] <= took_s
+    assert FRAMES * READING_S - 2 <= summary["duration_s"] <= took_s
+    assert summary["frames_captured"] == FRAMES
+
+
+def test_an_edge_that_hangs_is_reported(tmp_path):
+    """All that was counted would be lost with it, and the reason; and a small board has no memory for threads."""
+    hung, goes_on = threading.Event(), threading.Event()
+
+    def before(frame: Frame) -> None:
+        if frame.index == 3:
+            hung.set()
+            goes_on.wait()
+
+    hanging = edge(tmp_path, Staged(before))
+    assert hanging.given_up().summary is None, "nothing is known yet"
+    run, there = threading.Thread(target=hanging.run), set(threading.enumerate())
+    run.start()
+    try:
+        assert hung.wait(60)
+        names = {one.name for one in {*threading.enumerate()} - there - {run}}
+        own = {one for one in names if one.startswith("hvt-")}
+        assert own <= {"hvt-link-watch", "hvt-sockets", "hvt-stills"}
+        assert len(names) <= 6, "and one of Zenoh's for each channel that it answers on"
+        summary = hanging.given_up().summary
+    finally:
+        goes_on.set()
+        run.join()
+    assert summary["frames_captured"] == 3
+    assert "hangs" in next(one["reason"] for one in summary["failed"] if one["part"] == "flight")
+
+
+@pytest.mark.parametrize(
+    ("settings", "opened"),
+    [
+        ({"pace": "lockstep"}, 0),
+        ({}, 0),
+        ({"send_tracks": True}, 1),
+        ({"method": "M2", "pace": "lockstep"}, 1),
+    ],
+)
+def test_video_alone_opens_no_detector(tmp_path, settings, opened):
+    """A third of the processor would go to tracks that nobody is sent."""
+    world = Staged()
+    summary = edge(tmp_path, world, **settings).run()
+    assert (world.opened, summary["frames"] > 0, summary.get("failed") or None) == (opened, True, None)
+
+
+def test_a_wrong_endpoint_is_refused_before_a_model_is_opened(tmp_path):
+    """A board opens its models for half a minute, and then said what was wrong with the command."""
+    world = Staged()
+    with pytest.raises(UserError, match="is not usable: PROTOCOL"):
+        edge(tmp_path, world, method="M2", connect=("tcp/127.0.0.1",)).run()
+    assert world.opened == 0
 
 
 def test_a_flight_that_breaks_off_is_reported_all_the_same(tmp_path, caplog):
     """Table and --summary of an hour were lost with the last second."""
-    write_scene(tmp_path, frames=10)
-    config = EdgeConfig(
-        source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M0",
-        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0, pace="lockstep",
-    )  # fmt: skip
-    told, world = [], TornWorld()
+
+    def before(frame: Frame) -> None:
+        if frame.index == 6:
+            raise UserError("it is torn")
+
+    told, world = [], Staged(before)
     with pytest.raises(FlightError, match="it is torn"):
-        reported(Edge(check(config), stop=threading.Event(), world=world).run, told.append)
-    (summary,) = told
-    last = world.reports[-1]
+        reported(edge(tmp_path, world, pace="lockstep").run, told.append)
+    (summary,), last = told, world.reports[-1]
     assert (last.state, [one.reason for one in last.failed]) == ("ended", ["it is torn"]), (
         "the ground is told"
     )
@@ -212,8 +159,7 @@ class FragileDetector(Detector):
         self.first, self.runs, self._stop = first, 0, stop
         self.alone: bool | None = None
 
-    def detect(self, image_bgr: Image) -> Detections:
-        """See there."""
+    def detect(self, image_bgr):
         self.runs += 1
         if self.first is None and self.runs > 2:
             raise RuntimeError("it stumbles")
@@ -226,8 +172,7 @@ class FragileDetector(Detector):
 class EndlessSource(PassedOn):
     """The first frame of another, again and again."""
 
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """See there."""
+    def frames(self, *, start_ns: int):
         first = next(iter(self._inner.frames(start_ns=start_ns)))
         for index in itertools.count():
             yield replace(first, index=index, capture_ns=start_ns + round(index * 1e9 / self.fps))
@@ -243,11 +188,9 @@ class FragileWorld(World):
         self.second: FragileDetector | None = None
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """See there."""
         return EndlessSource(super().open_source(config), before=lambda _frame: None)
 
     def open_detector(self, config: EdgeConfig) -> Detector:
-        """See there."""
         opened = FragileDetector(self.first, self.stop)
         if self.first is None:
             self.first = weakref.ref(opened)
@@ -258,13 +201,8 @@ class FragileWorld(World):
 
 def test_a_detector_that_failed_does_not_stay_beside_its_successor(tmp_path):
     """The edge would hold two networks from the first failure on, 100 MB more, and a small board end it."""
-    write_scene(tmp_path, frames=2)
-    config = EdgeConfig(
-        source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M2",
-        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0, detect_every=1,
-    )  # fmt: skip
     world = FragileWorld()
-    Edge(check(config), stop=world.stop, world=world).run()
+    edge(tmp_path, world, stop=world.stop, frames=2, method="M2", detect_every=1).run()
     assert world.second is not None, "it was opened again"
     assert world.second.alone
 
@@ -277,7 +215,6 @@ class CompilingWorld(World):
         self.begun, self.go_on = threading.Event(), threading.Event()
 
     def open_detector(self, config: EdgeConfig) -> Detector:
-        """See there."""
         self.begun.set()
         assert self.go_on.wait(timeout=200)
         return super().open_detector(config)
@@ -286,14 +223,9 @@ class CompilingWorld(World):
 @pytest.mark.parametrize("detector", ["motion", "aerial-nano"])
 def test_an_edge_can_be_stopped_while_a_runtime_compiles(tmp_path, detector):
     """Ctrl-C did nothing for as long as that takes, minutes for some networks and boards."""
-    write_scene(tmp_path, frames=2)
-    config = EdgeConfig(
-        source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M2",
-        detector=detector, connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0,
-    )  # fmt: skip
     world, stop = CompilingWorld(), threading.Event()
     with ThreadPoolExecutor(1) as pool:
-        flight = pool.submit(Edge(check(config), stop=stop, world=world).run)
+        flight = pool.submit(edge(tmp_path, world, stop=stop, method="M2", detector=detector).run)
         try:
             assert world.begun.wait(timeout=200)
             stop.set()

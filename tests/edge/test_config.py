@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import pwd
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,14 +20,19 @@ from hvt_edge.stills.policy.registry import METHODS
 from hvt_edge.video.encoder import keyframe_floor_bytes
 
 
-def read(*argv: str) -> EdgeConfig:
+def read(*argv: str) -> tuple[EdgeConfig, Any]:
     """What a command line gives, before it is checked."""
-    return load(EdgeConfig, ["--source", "demo", *argv], program="hvt-edge", description="")[0]
+    return load(EdgeConfig, ["--source", "demo", *argv], program="hvt-edge", description="")
 
 
 def settled(*argv: str) -> EdgeConfig:
-    """What a command line gives."""
-    return check(read(*argv))
+    return check(read(*argv)[0])
+
+
+def flown(*argv: str) -> tuple[EdgeConfig, Mapping[str, Any]]:
+    """The settings that fly, with their profile, and the given ones."""
+    config, given = read(*argv)
+    return check(with_profile(config, given=given.values)), given.values
 
 
 @pytest.mark.parametrize(
@@ -41,8 +48,7 @@ def settled(*argv: str) -> EdgeConfig:
 )
 def test_what_pays_is_measured_unless_a_method_is_asked_for(given, measures, method, codec):
     """A first user would get the paper's stills, which lose against plain video."""
-    config, words = load(EdgeConfig, ["--source", "demo", *given], program="hvt-edge", description="")
-    config = check(with_profile(config, given=words.values))
+    config, _ = flown(*given)
     assert (config.measures, config.method, config.still_codec) == (measures, method, codec)
 
 
@@ -51,12 +57,8 @@ def test_what_is_said_without_flags_is_the_low_regime():
     config = settled()
     assert (config.budget_bps, config.base_bps) == (800_000, 650_000)
     assert (config.size, config.fps, config.method) == (None, 15.0, "M5")
-    assert (config.jpeg_quality, config.padding, config.cooldown, config.detect_every) == (
-        65,
-        0.15,
-        2.0,
-        None,
-    )
+    others = (config.jpeg_quality, config.padding, config.cooldown, config.detect_every)
+    assert others == (65, 0.15, 2.0, None)
 
 
 @pytest.mark.parametrize(
@@ -80,23 +82,19 @@ def test_budget_regime_and_share_settle_to_two_rates(argv, total, base):
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (
-            ["--method", "M0", "--video-share", "0.8"],
-            "--video-share 0.8 does not count: method M0 sends video",
+        ("--method M0 --video-share 0.8", "--video-share 0.8 does not count: method M0 sends video"),
+        ("--profile tracks --video-share auto", "--video-share auto does not count: method M0"),
+        *(
+            (argv, "")
+            for argv in ("--method M0 --video-share 1", "--method M5 --video-share 0.8", "--method M0")
         ),
-        (["--profile", "tracks", "--video-share", "auto"], "--video-share auto does not count: method M0"),
-        (["--method", "M0", "--video-share", "1"], ""),
-        (["--method", "M5", "--video-share", "0.8"], ""),
-        (["--method", "M0"], ""),
-        (["--regime", "moderate"], ""),
-        ([], ""),
+        *((argv, "") for argv in ("--regime moderate", "")),
     ],
 )
 def test_a_share_that_does_not_count_is_said(argv, said):
     """Whoever gave it would look for the rest of the budget."""
-    config, loaded = load(EdgeConfig, ["--source", "demo", *argv], program="p", description="d")
-    config = check(with_profile(config, given=loaded.values))
-    note = note_on_share(config, given=loaded.values)
+    config, given = flown(*argv.split())
+    note = note_on_share(config, given=given)
     assert note.startswith(said)
     assert bool(note) == bool(said)
 
@@ -124,7 +122,7 @@ def test_a_budget_whose_window_holds_no_keyframe_is_refused_with_the_least_that_
 def test_the_users_own_folder_may_be_written_short(option, monkeypatch, tmp_path):
     """No shell makes one of --source=~/clip.mp4, and the edge looked for a folder of the name ~."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert getattr(read(f"--{option}=~/flight"), option) == str(tmp_path / "flight")
+    assert getattr(read(f"--{option}=~/flight")[0], option) == str(tmp_path / "flight")
 
 
 @pytest.mark.parametrize("option", ["source", "pose"])
@@ -139,7 +137,7 @@ def test_a_user_without_a_folder_is_told_so(option, monkeypatch):
 def test_the_short_help_is_short_and_grouped(capsys):
     """A first reader would look for --budget among sixty settings."""
     with pytest.raises(SystemExit):
-        load(EdgeConfig, ["--help"], program="hvt-edge", description="")
+        read("--help")
     out = capsys.readouterr().out
     flags = re.findall(r"^  (?:-h, )?--[a-z-]+", out, re.MULTILINE)
     assert 20 <= len(flags) <= 30
@@ -152,7 +150,7 @@ def test_the_short_help_is_short_and_grouped(capsys):
 def test_every_flag_explains_itself(capsys):
     """Somebody with a drone in the field would have to read the source."""
     with pytest.raises(SystemExit):
-        load(EdgeConfig, ["--help-all"], program="hvt-edge", description="")
+        read("--help-all")
     out = " ".join(capsys.readouterr().out.split())
     for one in dataclasses.fields(EdgeConfig):
         flag = "--" + one.name.replace("_", "-")
@@ -228,14 +226,12 @@ def test_the_least_gain_reaches_the_suppression():
     """`--min-gain` decides how much bits go to tracks that look the same as before."""
     from hvt_edge.wiring.perception import make_suppression
 
-    config = check(load(EdgeConfig, ["--source", "demo", "--min-gain", "3"], program="p", description="")[0])
-    assert make_suppression(config).min_gain == 3
-    plain = check(load(EdgeConfig, ["--source", "demo", "--cooldown", "0"], program="p", description="")[0])
-    assert make_suppression(plain).min_gain == 1
+    assert make_suppression(settled("--min-gain", "3")).min_gain == 3
+    assert make_suppression(settled("--cooldown", "0")).min_gain == 1
 
 
 def test_a_frame_rate_that_the_window_does_not_hold_is_refused_by_its_name():
     """Who gave --fps 1 was told that a --window, which he had not given, is wrong; and the one to give was, too."""
     with pytest.raises(UserError, match=r"--window 1s is shorter .* of --fps 1.5: give --window 1\.334s or"):
-        settled("--source", "demo", "--fps", "1.5")
-    assert settled("--source", "demo", "--fps", "1.5", "--window", "1.334s").window == 1.334
+        settled("--fps", "1.5")
+    assert settled("--fps", "1.5", "--window", "1.334s").window == 1.334

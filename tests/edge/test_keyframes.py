@@ -1,4 +1,4 @@
-"""When a keyframe comes, and who may request one."""
+"""What holds in flight; when a keyframe comes, and who may request one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_edge.operating import Keyframes, KeyframeSettings
+from hvt_edge.operating import Keyframes, KeyframeSettings, LoopClock, Operating, Rates, base_rate_bps
 
 MS = 1_000_000
 STEP_NS = 66_666_667
@@ -28,30 +28,31 @@ def play(plan: Keyframes, steps: int, *, fits=lambda _n: True, asked=lambda _n: 
     return keyframes
 
 
-def test_the_first_frame_is_one_whatever_the_budget():
-    """Nobody could decode anything."""
-    plan = Keyframes(KeyframeSettings(interval_ns=0))
+@pytest.mark.parametrize(
+    ("interval_ms", "fits", "keyframes"),
+    [
+        (0, lambda _n: False, [0]),
+        (1_000, lambda _n: True, [0, 15, 30]),
+        (1_000, lambda n: n % 20 == 19, [0, 19, 39]),  # due at 15 and 34, room at 19 and 39
+        (1_000, lambda _n: False, [0, 21]),
+    ],
+)
+def test_the_first_frame_is_one_and_the_schedule_waits_for_room(interval_ms, fits, keyframes):
+    """Nobody could decode anything, or enter a recording in its middle; or a keyframe not wait for its budget."""
+    plan = Keyframes(KeyframeSettings(interval_ns=interval_ms * MS, scheduled_patience_ns=400 * MS))
     assert plan.due(0)
-    assert play(plan, 300, fits=lambda _n: False) == [0]
-    assert plan.sent == 1
+    assert play(plan, 40, fits=fits) == keyframes
+    assert plan.sent == len(keyframes)
 
 
-def test_the_schedule_is_kept_and_waits_for_room():
-    """A recording could not be entered in its middle; or the keyframe would not wait for its budget."""
-    plan = Keyframes(KeyframeSettings(interval_ns=1_000 * MS))
-    assert play(plan, 50) == [0, 15, 30, 45]
-    plan = Keyframes(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
-    assert play(plan, 40, fits=lambda n: n % 20 == 19) == [0, 19, 39]  # due at 15 and 34, room at 19 and 39
-    plan = Keyframes(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
-    assert play(plan, 40, fits=lambda _n: False) == [0, 21]
-
-
-def test_while_one_is_due_stills_know_it():
-    """Stills would go on taking the room that the keyframe waits for."""
-    plan = Keyframes(KeyframeSettings(interval_ns=0))
+@pytest.mark.parametrize("interval_ms", [0, 1_000])
+def test_while_one_is_due_stills_know_it(interval_ms):
+    """Stills would go on taking the room that the keyframe waits for, requested or of the schedule."""
+    plan = Keyframes(KeyframeSettings(interval_ns=interval_ms * MS))
     plan.done(0)
-    assert not plan.due(1_000 * MS)
-    assert plan.request(1_000 * MS) is None
+    assert not plan.due(999 * MS)
+    if not interval_ms:
+        assert plan.request(1_000 * MS) is None
     assert plan.due(1_000 * MS)
     assert not plan.now(1_100 * MS, fits=False)
     assert plan.due(1_100 * MS)
@@ -64,10 +65,9 @@ def test_a_request_that_crossed_a_keyframe_is_answered_by_it():
     """One loss would cost two keyframes, and the second would push pictures and stills aside for nothing."""
     plan = Keyframes(KeyframeSettings(interval_ns=0))
     plan.done(0)
-    assert plan.request(200 * MS) is None
-    assert not plan.due(250 * MS)
-    assert plan.request(400 * MS) is None
-    assert plan.due(400 * MS)
+    for asked_ms, due in ((200, False), (400, True)):
+        assert plan.request(asked_ms * MS) is None
+        assert plan.due(asked_ms * MS) == due
     assert plan.served == 2
 
 
@@ -109,21 +109,6 @@ def test_every_request_is_answered_in_time_and_not_more_often(asks, room, interv
         assert because_asked or (interval_s and (second - first) * STEP_NS >= settings.interval_ns)
 
 
-def ask_at_twenty_a_second(plan: Keyframes, *, takes_ms: int, losses: bool) -> tuple[int, list[str]]:
-    """Keyframes and refusals of a minute."""
-    keyframes, refusals = 0, []
-    for number, now_ns in enumerate(range(0, 60_000 * MS, 50 * MS)):
-        if losses:
-            plan.report_losses(number, 2**40 + number)
-        if (refusal := plan.request(now_ns)) is not None:
-            refusals.append(refusal)
-        if plan.now(now_ns, fits=True):
-            plan.done(now_ns)
-            plan.note_cost(takes_ms * MS)
-            keyframes += 1
-    return keyframes, refusals
-
-
 @pytest.mark.parametrize(
     ("takes_ms", "losses", "most"),
     [
@@ -135,9 +120,16 @@ def ask_at_twenty_a_second(plan: Keyframes, *, takes_ms: int, losses: bool) -> t
 )
 def test_a_commander_cannot_make_the_stream_all_keyframes(takes_ms, losses, most):
     """Whoever may command could push pictures and stills aside with three keyframes a second, for ever."""
-    plan = Keyframes(KeyframeSettings(interval_ns=0))
-    keyframes, refusals = ask_at_twenty_a_second(plan, takes_ms=takes_ms, losses=losses)
-    assert 30 < keyframes <= most, "three a second would be 180"
+    plan, refusals = Keyframes(KeyframeSettings(interval_ns=0)), []
+    for number, now_ns in enumerate(range(0, 60_000 * MS, 50 * MS)):
+        if losses:
+            plan.report_losses(number, 2**40 + number)
+        if (refusal := plan.request(now_ns)) is not None:
+            refusals.append(refusal)
+        if plan.now(now_ns, fits=True):
+            plan.done(now_ns)
+            plan.note_cost(takes_ms * MS)
+    assert 30 < plan.sent <= most, "three a second would be 180"
     assert plan.served == 1200 - len(refusals)
     assert "the last keyframe came" in refusals[-1]
     assert "ask again in" in refusals[-1]
@@ -225,11 +217,29 @@ def test_the_edges_own_requests_come_from_any_thread_and_cost_nothing():
     assert (both.sent, both.served) == (2, 0)
 
 
-def test_the_plan_publishes_what_it_waits_for():
-    """Stills would take the room of a scheduled keyframe that waits for its own."""
-    both = Keyframes(KeyframeSettings(interval_ns=1_000 * MS))
-    both.done(0)
-    assert not both.due(999 * MS)
-    assert both.due(1_000 * MS)
-    assert not both.now(1_000 * MS, fits=False)
-    assert both.due(1_001 * MS)
+def test_a_reader_has_one_moment():
+    """Status would tell the budget of now with the rate of before."""
+    holder = Operating(budget_bps=400_000, video_share=0.75, base_bps=300_000, method="M5", decimation=1)
+    before = holder.now
+    holder.command(budget_bps=200_000, video_share=None, method="M6")
+    holder.open(Rates(total_bps=150_000, base_bps=100_000, decimation=3), total_bps=150_000)
+    assert (before.budget_bps, before.method, before.decimation) == (400_000, "M5", 1)
+    now = holder.now
+    assert (now.budget_bps, now.video_share, now.method) == (200_000, None, "M6")
+    assert (now.total_bps, now.base_bps, now.decimation) == (150_000, 100_000, 3)
+    assert now.highest_budget_bps == 400_000, "the summary compares with the most that was allowed"
+
+
+def test_media_time_and_wall_time():
+    """In lockstep a keyframe that a ground requests would come at another frame in each run."""
+    wall = [5]
+    media, real = LoopClock(lambda: wall[0], lockstep=True), LoopClock(lambda: wall[0], lockstep=False)
+    for clock in (media, real):
+        clock.advance(77)
+    assert (media(), real()) == (77, 5)
+
+
+def test_tracks_are_left_their_part_of_the_budget():
+    """Video at a share of 1 would leave tracks nothing, and exceed the budget with them."""
+    assert base_rate_bps(400_000, 0.75, metadata_bps=8_000) == 300_000
+    assert base_rate_bps(400_000, 1.0, metadata_bps=8_000) == 392_000

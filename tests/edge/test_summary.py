@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
@@ -26,11 +28,10 @@ def summary_of(
     unreached: str = "",
 ) -> dict[str, Any]:
     """Of a short flight."""
+    says = "no tracks: the video hides 0 objects; stills: they name 2 of 3 otherwise"
     now = SimpleNamespace(
         method="M6",
-        decisions=SimpleNamespace(
-            says="no tracks: the video hides 0 objects; stills: they name 2 of 3 otherwise"
-        ),
+        decisions=SimpleNamespace(says=says),
         preset="superfast",
         preset_says="preset superfast: veryfast would take 0.5 of a core",
         highest_budget_bps=800_000,
@@ -97,16 +98,18 @@ def test_a_flight_that_nobody_received_claims_no_bytes():
     assert not {"base", "stills", "stills sent"} & rows.keys()
 
 
-def test_what_is_stored_for_later_is_no_flight_in_vain():
+@pytest.mark.parametrize(
+    ("groups", "says"),
+    [
+        ({"stored": 150}, "stored for later (nobody subscribed to its video)"),
+        ({}, "NOT SENT (nobody subscribed to its video): it ended before its first picture"),
+    ],
+)
+def test_what_is_stored_for_later_is_no_flight_in_vain(groups, says):
     """A recorder that works as meant would be called failed by systemd."""
-    stored = summary_of(frames=FrameAccount({"stored": 150}), unreached="nobody subscribed to its video")
-    assert not in_vain(stored)
-    assert title(stored) == "uav-1: stored for later (nobody subscribed to its video)"
-    unborn = summary_of(frames=FrameAccount(), unreached="nobody subscribed to its video")
-    assert not in_vain(unborn)
-    assert title(unborn) == (
-        "uav-1: NOT SENT (nobody subscribed to its video): it ended before its first picture"
-    )
+    content = summary_of(frames=FrameAccount(groups), unreached="nobody subscribed to its video")
+    assert not in_vain(content)
+    assert title(content) == f"uav-1: {says}"
 
 
 def test_every_key_stands_on_the_page_of_the_summary():

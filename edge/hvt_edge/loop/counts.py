@@ -38,14 +38,6 @@ class Cores:
     """Cores that this process takes."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Sample:
-    wall_s: float
-    own_s: float
-    busy_s: float
-    """Busy time of all processes on the cores that this one may use."""
-
-
 class CpuMeter:
     """Measures from one call of `measure` to the next."""
 
@@ -60,12 +52,11 @@ class CpuMeter:
         ``short``: work was left out for want of time.
         """
         last, here = self._last, _sample()
-        if last is None or here is None or here.wall_s - last.wall_s < _LEAST_S:
+        if last is None or here is None or here[0] - last[0] < _LEAST_S:
             return
         self._last = here
-        wall_s, own_s = here.wall_s - last.wall_s, here.own_s - last.own_s
-        others = max(0.0, here.busy_s - last.busy_s - own_s) / wall_s
-        taken = own_s / wall_s
+        wall_s, own_s, busy_s = (new - old for new, old in zip(here, last, strict=True))
+        others, taken = max(0.0, busy_s - own_s) / wall_s, own_s / wall_s
         self.now = Cores(
             needed=taken * scale, free=max(0.0, min(len(usable_cores()) - others, quota())), taken=taken
         )
@@ -118,7 +109,8 @@ def usable_cores() -> set[int]:
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
-def _sample() -> _Sample | None:
+def _sample() -> tuple[float, float, float] | None:
+    # Seconds so far: by the clock, of this process, and of all on the cores that this one may use.
     names = {f"cpu{core}" for core in usable_cores()}
     try:
         rows = [line.split() for line in STAT.read_text(encoding="ascii").splitlines()]
@@ -129,7 +121,7 @@ def _sample() -> _Sample | None:
         )
     except (OSError, ValueError, IndexError):
         return None
-    return _Sample(time.monotonic(), time.process_time(), busy / os.sysconf("SC_CLK_TCK"))
+    return time.monotonic(), time.process_time(), busy / os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(slots=True)

@@ -81,7 +81,6 @@ class RealtimePace:
         self._must_code_ns = 0
         self._lost_ns = -_STEADY_NS
         self._none_due_ns = 0
-        """When last no keyframe was due."""
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because of a slow link, not yet made up."""
         self._bound: FrameGroup = "processor"
@@ -262,15 +261,12 @@ class LinkControl:
 
         def before_frame(now_ns: int) -> None:
             turn()
-            self._after_last(now_ns)
+            self.stills.store_lost(now_ns)
+            self.before_frame(now_ns)
+            self.admits(now_ns)  # this gives up lost messages: without frames nothing else would
 
         if self.backlog is not None:
             self.backlog.finish(before_frame=before_frame, stop=stop, note=note)
-
-    def _after_last(self, now_ns: int) -> None:
-        self.stills.store_lost(now_ns)
-        self.before_frame(now_ns)
-        self.admits(now_ns)  # this gives up lost messages: without frames nothing else would
 
     def on_feedback(self, feedback: Feedback) -> None:
         """A ground reports (any thread). Where that fails the rate falls to its floor until a report counts again."""

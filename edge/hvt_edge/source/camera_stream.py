@@ -180,7 +180,6 @@ class CameraDecoder:
         self._size = size
 
     def skip(self) -> None:
-        """Note that packets are missing before the next one."""
         self.whole = False
 
     def decode(self, packet: bytes) -> tuple[CameraUnit, YuvPicture] | None:

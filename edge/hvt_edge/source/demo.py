@@ -1,5 +1,6 @@
 """The drawn demo scene as a source. A package offers one by the entry point ``demo`` in the group ``hvt.scenes``.
 
+`hvt_scene.Scene` shows its contract.
 ``demo:codes`` has codes painted on roofs, to be read; ``demo:4k`` has 3840x2160 pixels; ``demo:codes,4k`` both.
 
 It is drawn in a process of its own, as a camera is a device of its own: its ground takes 170 MB, and a picture 30 ms,
@@ -19,13 +20,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
-from hvt_common.values import Frame, Image, Pose, View
+from hvt_common.values import Frame, Image, Pose
 from hvt_edge.source.contract import Source, SourceSettings
 from hvt_edge.source.resample import Resizer, capture_time_ns
 
@@ -49,27 +50,6 @@ def demo_scene(spec: str) -> dict[str, Any]:
             known = ", ".join(f"demo:{one}" for one in (*SCENE_WORDS, ",".join(SCENE_WORDS)))
             raise UserError(f"source {spec!r} has the unknown word {word!r}: accepted are demo, {known}")
     return dict(SCENE_WORDS[word] for word in words)
-
-
-class DrawnScene(Protocol):
-    """The edge's view of a drawn scene; made by ``scene(seed)``, or with the further arguments of `demo_scene`."""
-
-    size: tuple[int, int]
-    """(width, height) of its pictures in pixels."""
-    class_names: tuple[str, ...]
-    duration_s: float
-
-    def image(self, t_s: float) -> Image:
-        """The picture at a moment: BGR, uint8, (height, width, 3)."""
-        ...
-
-    def pose(self, t_s: float) -> Pose:
-        """The camera's pose at a moment; ``capture_ns`` counts from the scene's beginning."""
-        ...
-
-    def write_truth(self, path: Path, *, fps: float, view: View) -> int:
-        """Write the ground truth of a flight at that rate as MOTChallenge's gt.txt, in base pixels."""
-        ...
 
 
 class DemoSource(Source):
@@ -169,7 +149,7 @@ def _end(drawing: subprocess.Popen[bytes]) -> None:
 
 def _draw(seed: int, spec: str) -> None:
     (entry,) = entry_points(group="hvt.scenes", name="demo")
-    scene: DrawnScene = entry.load()(seed, **demo_scene(spec))
+    scene = entry.load()(seed, **demo_scene(spec))
     # Not `sys.stdout.buffer`: with PYTHONUNBUFFERED it has no buffer, and a signal cuts its writes short.
     answers = io.BufferedWriter(io.FileIO(sys.stdout.fileno(), "w", closefd=False))
     requests = sys.stdin.buffer
@@ -195,12 +175,6 @@ def check_truth(path: Path | None, source: Source) -> None:
     """Refuse ``--truth`` for a source without ground truth; `UserError`."""
     if path is not None and not isinstance(source, DemoSource):
         raise UserError(f"--truth {path} is for --source demo: no other source knows its truth")
-
-
-def write_truth_of(source: Source, path: Path | None, *, fps: float) -> None:
-    """Write the demo's ground truth, if it is requested."""
-    if path is not None and isinstance(source, DemoSource):
-        source.write_truth(path, fps=fps)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ _MOST_PENDING = 8
 _STEADY_NS = 2 * SECOND_NS
 """After this time without a missed frame, one may wait beside the newest: a keyframe is slow to code."""
 SOURCE_PART = "source"
-"""The source's name among failed parts."""
 
 
 def patience_s(fps: float) -> float:

@@ -14,8 +14,7 @@ from hvt_common.runtime.host_names import with_small_scheme
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
 from hvt_edge.source.camera_stream import REENCODE
-from hvt_edge.source.coded_live import CodedLiveSource, CodedStreamGrabber
-from hvt_edge.source.coded_video import CodedVideoSource
+from hvt_edge.source.coded import CodedLiveSource, CodedStreamGrabber, CodedVideoSource
 from hvt_edge.source.contract import BaseSize, Source, SourceSettings, check_shape
 from hvt_edge.source.decoding.container import is_local
 from hvt_edge.source.demo import DemoSource, is_demo

@@ -152,7 +152,7 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     times: dict[Fraction, int] = {}
     damaged: int | None = None
     until_s, stamped = time.monotonic() + FIRST_S, is_stamped(container)
-    for packet in packets_of(container, stream):
+    for packet in live_packets_of(container, stream):
         camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
@@ -180,7 +180,7 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
 
 class _PyAvClock:
     # PyAV skips packets of a stream number that was not there at the start, as of another program, and restarts its
-    # timeout at each. From the time that `packets_of` sets on, this clock leaps ahead, so that PyAV gives up.
+    # timeout at each. From the time that `live_packets_of` sets on, this clock leaps ahead, so that PyAV gives up.
 
     here = threading.local()
     _leaps = itertools.count(1)
@@ -195,7 +195,7 @@ class _PyAvClock:
 av.container.core.time = _PyAvClock  # type: ignore[attr-defined]
 
 
-def packets_of(container: Any, stream: Any) -> Iterator[Any]:
+def live_packets_of(container: Any, stream: Any) -> Iterator[Any]:
     """The packets of the film as they come. Raises `SignalLost` after ten seconds of other packets alone."""
     packets = container.demux()  # for the film alone it would not return while others come
     until_s = time.monotonic() + _UNDECODED_S

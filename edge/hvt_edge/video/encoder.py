@@ -53,7 +53,6 @@ Its rate is lowered by that: for the first keyframe, one each ten seconds, and s
 _KEYFRAME_SHARE = 0.005
 """Largest share of the base's bytes for scheduled keyframes."""
 STATUS_BYTES = 320
-"""The size of a `Status`."""
 SLOWEST: Final = "veryfast"
 """The preset of studies, the demo and all of lockstep: there time does not matter."""
 _keys = lru_cache(maxsize=64)(EdgeKeys)
@@ -256,7 +255,6 @@ class HardwareRow:
 
 
 GROUP = "hvt.encoders"
-"""The group of the entry points."""
 X265 = "x265"
 """HVT's own, measured encoder: the only one that takes regions and needs no qualification."""
 PASSTHROUGH = "passthrough"
@@ -282,7 +280,6 @@ _ROWS = (
     HardwareRow("hevc_v4l2m2m", "nv12", "a board whose kernel has an HEVC encoder as a V4L2 device"),
 )
 HARDWARE: Mapping[str, HardwareRow] = MappingProxyType({row.codec: row for row in _ROWS})
-"""The rows by name."""
 _OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
 
 
@@ -302,8 +299,8 @@ def check_encoder(name: str) -> None:
 def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     """Open the encoder. Raises `UserError` if there is none, or it does not load or refuses the settings."""
     # Imported only to open one: at each start only names are checked.
-    from hvt_edge.video.encoders.hardware import HardwareEncoder  # noqa: PLC0415
-    from hvt_edge.video.encoders.passthrough import Passthrough  # noqa: PLC0415
+    from hvt_edge.video.hardware import HardwareEncoder  # noqa: PLC0415
+    from hvt_edge.video.passthrough import Passthrough  # noqa: PLC0415
     from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
 
     if name == X265:

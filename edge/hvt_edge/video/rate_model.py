@@ -16,7 +16,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Final
 
 from hvt_common.errors import UserError
@@ -142,17 +142,22 @@ def sizes_of(source_size: tuple[int, int]) -> list[tuple[int, int]]:
     return [size for size in sizes if size[0] * size[1] <= 1.05 * largest] or [whole]
 
 
+@dataclass(eq=False)
 class FrameSkip:
     """Codes each ``decimation``-th source frame. Where one was missed, the next is coded in its place.
 
     It codes no more frames than ``least_decimation()`` allows at the time of a keyframe.
     """
 
-    def __init__(self, decimation: int = 1, *, least_decimation: Callable[[], int] = lambda: 1) -> None:
-        assert decimation >= 1
-        self.decimation = self._wanted = decimation
-        """The n in force, changed by `at_keyframe` only; ``_wanted`` is n without the limit."""
-        self._least_decimation = least_decimation
+    decimation: int = 1
+    """The n in force, changed by `at_keyframe` only."""
+    _: KW_ONLY
+    least_decimation: Callable[[], int] = lambda: 1
+
+    def __post_init__(self) -> None:
+        assert self.decimation >= 1
+        self._wanted = self.decimation
+        """n without the limit."""
         self._next: int | None = None
 
     def codes(self, index: int) -> bool:
@@ -170,7 +175,7 @@ class FrameSkip:
     def at_keyframe(self, index: int) -> int:
         """Decide on ``decimation`` from this frame on, which will be a keyframe."""
         self._decide(index)
-        self.decimation = max(self._wanted, self._least_decimation())
+        self.decimation = max(self._wanted, self.least_decimation())
         return self.decimation
 
     def wants_keyframe(self, index: int) -> bool:
@@ -182,6 +187,7 @@ class FrameSkip:
         del index
 
 
+@dataclass(eq=False)
 class MeasuredFrameSkip(FrameSkip):
     """``--fps auto``: decided anew at keyframes, from the mean quantiser of the newest ``window_frames``.
 
@@ -189,23 +195,15 @@ class MeasuredFrameSkip(FrameSkip):
     decision depends on the coded frames alone, so that in lockstep the same input gives the same bytes.
     """
 
-    def __init__(
-        self,
-        decimation: int = 1,
-        *,
-        most_decimation: int,
-        rest_frames: int,
-        window_frames: int,
-        band: QuantiserBand = SPARING,
-        own_keyframes: bool = False,
-        least_decimation: Callable[[], int] = lambda: 1,
-    ) -> None:
-        super().__init__(decimation, least_decimation=least_decimation)
-        self._most_decimation = most_decimation
-        self._rest_frames = rest_frames
-        self._window_frames = window_frames
-        self._band = band
-        self._own_keyframes = own_keyframes
+    _: KW_ONLY
+    most_decimation: int
+    rest_frames: int
+    window_frames: int
+    band: QuantiserBand = SPARING
+    own_keyframes: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._decided_index: int | None = None
         self._quantisers: deque[tuple[int, float]] = deque()
         """(index, mean quantiser) of the newest frames."""
@@ -217,11 +215,11 @@ class MeasuredFrameSkip(FrameSkip):
             self._decided_index = index
         if not keyframe and math.isfinite(mean_qp):
             self._quantisers.append((index, mean_qp))
-        while self._quantisers and self._quantisers[0][0] <= index - self._window_frames:
+        while self._quantisers and self._quantisers[0][0] <= index - self.window_frames:
             self._quantisers.popleft()
 
     def wants_keyframe(self, index: int) -> bool:
-        return self._own_keyframes and self._may_decide(index) and self._better() < self._wanted
+        return self.own_keyframes and self._may_decide(index) and self._better() < self._wanted
 
     def _decide(self, index: int) -> None:
         if self._may_decide(index):
@@ -230,14 +228,14 @@ class MeasuredFrameSkip(FrameSkip):
 
     def _may_decide(self, index: int) -> bool:
         decided = self._decided_index
-        return decided is not None and index - decided >= self._rest_frames and bool(self._quantisers)
+        return decided is not None and index - decided >= self.rest_frames and bool(self._quantisers)
 
     def _better(self) -> int:
         return better_decimation(
             self._wanted,
             mean_qp=sum(qp for _, qp in self._quantisers) / len(self._quantisers),
-            most_decimation=self._most_decimation,
-            band=self._band,
+            most_decimation=self.most_decimation,
+            band=self.band,
         )
 
 

@@ -30,7 +30,6 @@ _WORTH = 0.04
 """Least change of the base rate, as a share, at a keyframe that is due anyway."""
 
 OpenEncoder = Callable[[Rates], Encoder]
-"""Opens the encoder for these rates."""
 
 
 def encoder_opener(
@@ -92,7 +91,6 @@ class EncoderReconfiguration:
         self._commanded = (now.budget_bps, now.video_share)
         """Budget and share that x265 was last opened under."""
         self.count = 0
-        """How often x265 was opened anew."""
 
     def track_link(self, now_ns: int) -> bool:
         """Hold the budget to the link's rate; True where the base should be opened anew, which needs a keyframe."""

@@ -78,7 +78,6 @@ class RegionTagger:
     def __init__(self) -> None:
         self._graph: Graph | None = None
         self._regions: Sequence[Region] = ()
-        """The regions of the graph."""
 
     def tag(self, picture: av.VideoFrame, regions: Iterable[Region], *, whole: float = 0.0) -> av.VideoFrame:
         """The same picture with these regions; where two overlap, the deeper one counts.

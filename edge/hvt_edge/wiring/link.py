@@ -14,7 +14,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.auto import AutoSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder import least_base_bps
-from hvt_edge.video.encoders.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
+from hvt_edge.video.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
 from hvt_edge.video.reconfigure import EncoderReconfiguration, Split
 from hvt_edge.wiring.perception import shows_details
 from hvt_edge.wiring.video import least_rate_bps
@@ -95,7 +95,13 @@ def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int,
         return None
     floor_bps = least_rate_bps(config, size)
     if stream is not None:
-        floor_bps = max(floor_bps, _camera_needs_bps(config, _surveyed_bytes(config, stream), config.share))
+        needs = needed_bps(
+            _surveyed_bytes(config, stream),
+            window_s=config.window,
+            share=config.share,
+            metadata_bps=config.metadata_bps,
+        )
+        floor_bps = max(floor_bps, needs)
     settings = RateSettings(ceiling_bps=config.budget_bps, floor_bps=min(config.budget_bps, floor_bps))
     return Pacer(RateController(settings))
 
@@ -104,17 +110,12 @@ def make_camera_rates(
     config: EdgeConfig, stream: CameraStream, reconfiguration: EncoderReconfiguration
 ) -> CameraRates:
     """Make the rates that change at the keyframes of a passed-through camera."""
-
-    def needed(window_bytes: int) -> int:
-        share = reconfiguration.operating.now.video_share or config.share
-        return _camera_needs_bps(config, window_bytes, share)
-
     return CameraRates(
         reconfiguration,
-        needed=needed,
+        share=config.share,
         least_bps=config.min_budget_bps,
         surveyed_bytes=_surveyed_bytes(config, stream),
-        window_ns=config.window_ns,
+        window_s=config.window,
     )
 
 
@@ -122,16 +123,9 @@ def make_least_link(config: EdgeConfig, line: Transmitter) -> LeastLink | None:
     """Make the bound on a camera's queued units; None if nothing measures the link."""
     if (pacer := line.pacer) is None:
         return None
-
-    def unreported_bytes() -> int:
-        return line.in_flight.size_bytes if pacer.measures else 0
-
-    return LeastLink(config.floor_bps, unreported_bytes=unreported_bytes)
-
-
-def _camera_needs_bps(config: EdgeConfig, window_bytes: int, share: float) -> int:
-    # The budget that a camera needs if its fullest window has ``window_bytes``; ``share`` is the base's share of it.
-    return needed_bps(window_bytes, window_s=config.window, share=share, metadata_bps=config.metadata_bps)
+    return LeastLink(
+        config.floor_bps, unreported_bytes=lambda: line.in_flight.size_bytes if pacer.measures else 0
+    )
 
 
 def _surveyed_bytes(config: EdgeConfig, stream: CameraStream) -> int:

@@ -37,7 +37,7 @@ from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.report.state import Heartbeat
 from hvt_edge.report.status import InfoReporter, StatusReporter
 from hvt_edge.source.contract import Source
-from hvt_edge.source.demo import write_truth_of
+from hvt_edge.source.demo import DemoSource
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Gate
@@ -77,7 +77,6 @@ class Flight:
     source: Source
     detector: FailingDetector
     ends: EdgeLink
-    """The link to grounds."""
     session_id: int
     ledger: Ledger
     counts: FrameCounts
@@ -297,7 +296,8 @@ class Stages:
         config, view = flight.config, flight.source.view
         self.link = link = Link(flight)
         # Files are made after all checks that may refuse the settings: a failed start leaves nothing behind.
-        write_truth_of(flight.source, config.truth, fps=config.nominal_fps)
+        if config.truth is not None and isinstance(flight.source, DemoSource):
+            flight.source.write_truth(config.truth, fps=config.nominal_fps)
         local_copy = None
         if config.record_base:
             copy = open_local_copy(config.record_base, failures=flight.failures, wait=flight.lockstep)

@@ -28,8 +28,8 @@ from hvt_edge.video.encoder import (
     payload_bps,
     usual_keyframe_bytes,
 )
-from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
-from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, run_frames
+from hvt_edge.video.passthrough import about_keyframes, check_camera
+from hvt_edge.video.qualification import Allowed, allowed, headroom_of, run_frames
 from hvt_edge.video.rate_model import (
     LEAST_SIDE_PX,
     PROMPT,
@@ -287,7 +287,7 @@ def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
 
     No keyframe can be smaller than `keyframe_floor_bytes`. If the rate fell below a keyframe's need, none would be
     sent; then nothing arrives, and a rate that grows with arrivals never grows again. The need of a camera's own
-    units is measured (`hvt_edge.video.encoders.passthrough`).
+    units is measured (`hvt_edge.video.passthrough`).
     """
     if config.passes_through:
         return config.min_budget_bps

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
@@ -35,73 +37,67 @@ class Faulty(FeedbackInbox):
         super().on_report(report)
 
 
-def test_a_watcher_that_stays_after_the_ground_has_left_is_served(tmp_path):
+@pytest.fixture
+def rig(tmp_path, request):
+    """A flight with a store; the test's parameter has its settings."""
+    made = Rig(tmp_path / "store", **getattr(request, "param", {}))
+    yield made
+    made.backlog.close()
+
+
+def test_a_watcher_that_stays_after_the_ground_has_left_is_served(rig):
     """A plain Zenoh program would get a frame a second for a quarter of a minute, and the store fill for nobody."""
-    rig = Rig(tmp_path / "store")
-    try:
-        rig.play(0, 45, reports=True)
-        rig.watched = True
-        rig.play(45, 120, linked=False)
-        shown = {one.frame_index for one in rig.out.base}
-        assert len(shown & set(range(47, 120))) >= 70
-        assert rig.backlog.frames <= 2
-        rig.watched = False
-        rig.play(120, 135, linked=False)
-        assert rig.backlog.frames >= 14, "with nobody there the flight is stored again"
-    finally:
-        rig.backlog.close()
+    rig.play(0, 45, reports=True)
+    rig.watched = True
+    rig.play(45, 120, linked=False)
+    shown = {one.frame_index for one in rig.out.base}
+    assert len(shown & set(range(47, 120))) >= 70
+    assert rig.backlog.frames <= 2
+    rig.watched = False
+    rig.play(120, 135, linked=False)
+    assert rig.backlog.frames >= 14, "with nobody there the flight is stored again"
 
 
-def test_reports_tell_how_soon_a_keyframe_is_known_to_be_lost(tmp_path):
+@pytest.mark.parametrize("rig", [{"adapt": True}], indirect=True)
+def test_reports_tell_how_soon_a_keyframe_is_known_to_be_lost(rig):
     """The screen would stay dark for as long as on a satellite link."""
-    rig = Rig(tmp_path / "store", adapt=True)
-    try:
-        rig.play(0, 30, reports=True)
-        rig.keyframes.done(rig.now_ns)
-        soon_ns = rig.now_ns + SECOND_NS // 4
-        assert rig.keyframes.request(soon_ns) is None
-        assert rig.keyframes.due(soon_ns)
-    finally:
-        rig.backlog.close()
+    rig.play(0, 30, reports=True)
+    rig.keyframes.done(rig.now_ns)
+    soon_ns = rig.now_ns + SECOND_NS // 4
+    assert rig.keyframes.request(soon_ns) is None
+    assert rig.keyframes.due(soon_ns)
 
 
-def test_a_forged_number_of_a_still_in_a_report_takes_none_for_received(tmp_path):
+def test_a_forged_number_of_a_still_in_a_report_takes_none_for_received(rig):
     """What the link has lost would never be sent again, nor stored when the link goes."""
-    rig = Rig(tmp_path / "store")
-    try:
-        rig.play(0, 15, reports=True)
-        rig.still(0)
-        forged = replace(rig.out.ground.report(rig.now_ns), still_sequence=2**32 - 9, missing_stills=())
-        rig.link_control.on_feedback(forged)
-        assert rig.outbox.unacknowledged == 1
-        rig.report()
-        assert rig.outbox.unacknowledged == 0
-    finally:
-        rig.backlog.close()
+    rig.play(0, 15, reports=True)
+    rig.still(0)
+    forged = replace(rig.out.ground.report(rig.now_ns), still_sequence=2**32 - 9, missing_stills=())
+    rig.link_control.on_feedback(forged)
+    assert rig.outbox.unacknowledged == 1
+    rig.report()
+    assert rig.outbox.unacknowledged == 0
 
 
-def test_a_report_that_cannot_be_used_lowers_the_rate_and_video_goes_on(tmp_path, caplog):
+@pytest.mark.parametrize("rig", [{"adapt": True, "inbox": Faulty()}], indirect=True)
+def test_a_report_that_cannot_be_used_lowers_the_rate_and_video_goes_on(rig, caplog):
     """An error in a thread of the link is nobody's: the edge would wait for ever for what never arrives."""
-    inbox = Faulty()
-    rig = Rig(tmp_path / "store", adapt=True, inbox=inbox)
-    try:
-        rig.play(0, 45, reports=True)
-        assert rig.pacer.rate_bps > 100_000
-        before = len(rig.out.base)
-        inbox.broken = True
-        rig.play(45, 105, reports=True)
-        assert rig.pacer.rate_bps == 100_000, "the floor"
-        assert len(rig.out.base) >= before + 4, "a frame a second at the least"
-        (failed,) = rig.failures.parts
-        assert (failed.part, failed.working) == ("reports", False)
-        assert "OverflowError: too much" in failed.reason
-        inbox.broken = False
-        rates = []
-        for first in range(105, 205, 10):
-            rig.play(first, first + 10, reports=True)
-            rates.append(rig.pacer.rate_bps)
-        assert max(rates) > 100_000, "it grows again"
-        assert rig.failures.parts[0].working
-    finally:
-        rig.backlog.close()
+    inbox = rig.link_control.inbox
+    rig.play(0, 45, reports=True)
+    assert rig.pacer.rate_bps > 100_000
+    before = len(rig.out.base)
+    inbox.broken = True
+    rig.play(45, 105, reports=True)
+    assert rig.pacer.rate_bps == 100_000, "the floor"
+    assert len(rig.out.base) >= before + 4, "a frame a second at the least"
+    (failed,) = rig.failures.parts
+    assert (failed.part, failed.working) == ("reports", False)
+    assert "OverflowError: too much" in failed.reason
+    inbox.broken = False
+    rates = []
+    for first in range(105, 205, 10):
+        rig.play(first, first + 10, reports=True)
+        rates.append(rig.pacer.rate_bps)
+    assert max(rates) > 100_000, "it grows again"
+    assert rig.failures.parts[0].working
     assert len(caplog.records) == 2

@@ -34,7 +34,6 @@ class Ground:
     def put(
         self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
-        """Take one message."""
         assert row is Channel.BASE
         assert attachment is not None
         self.frames.append(BaseHeader.parse(attachment, payload).frame_index)
@@ -58,16 +57,13 @@ class Stills:
         self.detected: list[tuple[int, int]] = []
 
     def analyze(self, frame, unit):
-        """Keep it."""
         self.seen.append((frame.index, unit and unit.frame_index))
         return frame.index
 
     def send_requested(self, *, now_ns, held):
-        """Nothing."""
         return set()
 
     def step(self, seen, *, now_ns, held):
-        """Nothing."""
         self.sends += 1
         return set()
 
@@ -116,7 +112,6 @@ class Silent(FeedbackInbox):
     tenths = 0
 
     def wait_for(self, *, frame_index: int, stills: set[int], timeout_s: float) -> bool:
-        """Passes no time."""
         del frame_index, stills
         self.tenths += round(10 * timeout_s)
         return False

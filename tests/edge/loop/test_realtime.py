@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
 
-from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -25,7 +22,6 @@ from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder import EncoderSettings
-from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from programs.processes import eventually
@@ -33,105 +29,6 @@ from rigs.messages import counted, feedback
 from rigs.world import make_base_stage, make_transmitter
 
 SIZE = (320, 192)
-
-
-class Out:
-    """Counts base frames."""
-
-    def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
-        self.units = 0
-        self.takes_s = 0.0
-        self.sleep = sleep
-
-    def put(self, channel, payload, *, attachment=None, encoding="") -> None:
-        """One message."""
-        self.units += channel is Channel.BASE
-        self.sleep(self.takes_s)
-
-
-class BlockedStills:
-    """Decodes what it is given; sending its first still takes until it is released."""
-
-    def __init__(self) -> None:
-        self.latest_tracks, self.outbox = None, Outbox()
-        self.released, self.decoder = threading.Event(), BaseDecoder()
-        self.frames: list[int] = []
-        self.decoded = 0
-        self.detected: list[int] = []
-        self.used, self.analyzer = True, SimpleNamespace(cpu_budget=CpuBudget())
-
-    def capture(self, frame):
-        """Nobody asks for a still of it."""
-
-    def is_used(self, capture_ns):
-        """Somebody looks at what comes of it."""
-        return self.used
-
-    def analyze(self, frame, unit, skipped=()):
-        """As `Analyzer.analyze` does: all units, in their order."""
-        for one in (*skipped, unit):
-            self.decoded += self.decoder.decode(one.data) is not None
-        self.frames.append(frame.index)
-
-    def step(self, seen, *, now_ns):
-        """A ``put`` that blocks."""
-        assert self.released.wait(60)
-
-    def on_results(self, results, *, detected=None):
-        """Keep what the ground detected."""
-        if detected is not None:
-            self.detected.append(detected.objects)
-
-
-def base_stage(out: Out) -> BaseStage:
-    """That sends there."""
-    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=100_000, preset="ultrafast"))
-    return make_base_stage(encoder, make_transmitter(out))
-
-
-def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
-    """The picture would freeze a second after a still met a full link, and thaw when the link does."""
-    out, stills, counts, inbox = Out(), BlockedStills(), FrameCounts(), FeedbackInbox()
-    inbox.on_report(counted(feedback(last_frame_index=0, objects_detected=7), now_ns=1))
-    base = base_stage(out)
-    frames = list(framed(smooth_pictures(60, size=SIZE)))
-    with RealtimePace(
-        base, stills, inbox=inbox, clock=SteadyClock(), fps=15, live=True, counts=counts,
-        stop=threading.Event(), failures=Failures(time.time_ns),
-    ) as pace:  # fmt: skip
-        for frame in frames[:50]:  # more than three seconds
-            pace.step(frame)
-        assert (out.units, counts.groups) == (50, {"sent": 50})
-        assert counts.unanalyzed > 40, "no more than half a second of frames waits to be tracked through"
-        stills.released.set()
-        for frame in frames[50:]:
-            pace.step(frame)
-        eventually(lambda: stills.detected == [7] and stills.decoded > max(stills.frames, default=99))
-    assert out.units == 60
-    assert stills.decoded == max(stills.frames) + 1, "no unit is missing before any frame that was analyzed"
-
-
-def test_frames_missed_count_for_the_link_or_for_the_machine():
-    """Who flies would buy a faster computer for a thin link."""
-    clock, stills, counts = SteppedTime(), BlockedStills(), FrameCounts()
-    out = Out(clock.pass_s)
-    stills.released.set()
-    frames = list(framed(smooth_pictures(6, size=SIZE)))
-    with RealtimePace(
-        base_stage(out), stills, inbox=FeedbackInbox(), clock=clock, fps=15, live=True, counts=counts,
-        stop=threading.Event(), failures=Failures(time.time_ns),
-    ) as pace:  # fmt: skip
-        pace.step(frames[0], missed=4)
-        assert counts.groups == {"sent": 1}, "what came before the first is nobody's fault"
-        out.takes_s = 0.5
-        pace.step(frames[1], missed=4)
-        out.takes_s = 0.0
-        pace.step(frames[2], missed=9)
-        assert (counts.groups["link"], counts.dropped_cpu) == (5, 0)
-        pace.step(frames[3], missed=12)
-        assert (counts.groups["link"], counts.dropped_cpu) == (5, 3)
-        assert counts.captured == 4 + 8
-        assert counts.unanalyzed == 1, "perception gave way where video was late, and not where the link was"
 
 
 class SteppedTime(threading.Event):
@@ -142,59 +39,123 @@ class SteppedTime(threading.Event):
         self.now_ns = START_NS
 
     def __call__(self) -> int:
-        """The clock."""
         return self.now_ns
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Sleep."""
-        assert timeout is not None
         self.pass_s(timeout)
         return self.is_set()
 
     def pass_s(self, seconds: float) -> None:
-        """Time goes by."""
         self.now_ns += round(seconds * SECOND_NS)
 
 
-class TimedOut(Out):
+class Out:
     """Keeps the headers of base frames; ``blocks_s(count)`` is how long the link takes for the next."""
 
-    def __init__(self, time_: SteppedTime, blocks_s=lambda _count: 0.0) -> None:
-        super().__init__()
-        self.time, self.blocks_s = time_, blocks_s
+    def __init__(self, blocks_s=lambda _count: 0.0) -> None:
+        self.time, self.blocks_s = SteppedTime(), blocks_s
         self.headers: list[BaseHeader] = []
 
     def put(self, channel, payload, *, attachment=None, encoding="") -> None:
-        """One message, which takes its time."""
         self.time.pass_s(self.blocks_s(len(self.headers)))
         self.headers.append(BaseHeader.parse(attachment, payload))
 
 
+class BlockedStills:
+    """Decodes what it is given; sending its first still takes until it is released."""
+
+    def __init__(self, *, released: bool = True) -> None:
+        self.latest_tracks, self.outbox = None, Outbox()
+        self.released, self.decoder = threading.Event(), BaseDecoder()
+        self.frames: list[int] = []
+        self.decoded = 0
+        self.detected: list[int] = []
+        self.analyzer = SimpleNamespace(cpu_budget=CpuBudget())
+        if released:
+            self.released.set()
+
+    def capture(self, frame):
+        """Nobody asks for a still of it."""
+
+    def is_used(self, capture_ns):
+        return True
+
+    def analyze(self, frame, unit, skipped=()):
+        for one in (*skipped, unit):
+            self.decoded += self.decoder.decode(one.data) is not None
+        self.frames.append(frame.index)
+
+    def step(self, seen, *, now_ns):
+        assert self.released.wait(60)
+
+    def on_results(self, results, *, detected=None):
+        if detected is not None:
+            self.detected.append(detected.objects)
+
+
+def paced(out: Out, stills: BlockedStills, **parts) -> RealtimePace:
+    """The loop of a clip at 15 frames a second, with real x265; ``parts`` are in place of its own."""
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=100_000, preset="ultrafast"))
+    plain = {"inbox": FeedbackInbox(), "clock": out.time, "stop": out.time, "failures": Failures(out.time)}
+    plain |= {"fps": 15, "live": False, "counts": FrameCounts()}
+    return RealtimePace(make_base_stage(encoder, make_transmitter(out)), stills, **(plain | parts))
+
+
+def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
+    """The picture would freeze a second after a still met a full link, and thaw when the link does."""
+    out, stills, inbox = Out(), BlockedStills(released=False), FeedbackInbox()
+    inbox.on_report(counted(feedback(last_frame_index=0, objects_detected=7), now_ns=1))
+    frames = list(framed(smooth_pictures(60, size=SIZE)))
+    with paced(out, stills, inbox=inbox, clock=SteadyClock(), live=True, stop=threading.Event()) as pace:
+        for frame in frames[:50]:  # more than three seconds
+            pace.step(frame)
+        assert (len(out.headers), pace.counts.groups) == (50, {"sent": 50})
+        assert pace.counts.unanalyzed > 40, "no more than half a second of frames waits to be tracked through"
+        stills.released.set()
+        for frame in frames[50:]:
+            pace.step(frame)
+        eventually(lambda: stills.detected == [7] and stills.decoded > max(stills.frames, default=99))
+    assert len(out.headers) == 60
+    assert stills.decoded == max(stills.frames) + 1, "no unit is missing before any frame that was analyzed"
+
+
+def test_frames_missed_count_for_the_link_or_for_the_machine():
+    """Who flies would buy a faster computer for a thin link."""
+    out, (first, second, third, fourth) = Out(), framed(smooth_pictures(4, size=SIZE))
+    with paced(out, BlockedStills(), live=True) as pace:
+        counts = pace.counts
+        pace.step(first, missed=4)
+        assert counts.groups == {"sent": 1}, "what came before the first is nobody's fault"
+        out.blocks_s = lambda _count: 0.5
+        pace.step(second, missed=4)
+        out.blocks_s = lambda _count: 0.0
+        pace.step(third, missed=9)
+        assert (counts.groups["link"], counts.dropped_cpu) == (5, 0)
+        pace.step(fourth, missed=12)
+        assert (counts.groups["link"], counts.dropped_cpu, counts.captured) == (5, 3, 4 + 8)
+        assert counts.unanalyzed == 1, "perception gave way where video was late, and not where the link was"
+
+
 def play_clip(
-    *, reading_s: float, frames: int, out: TimedOut, coded: bool = False, slow: int = 1000
+    *, reading_s: float, frames: int, out: Out, coded: bool = False, slow: int = 1000
 ) -> FrameCounts:
     """A clip at 15 fps, ``coded`` by a camera or not, each frame of which takes so long to read, and x265.
 
     One frame in ``slow`` takes two and a half times the time between two.
     """
-    stills, counts, pictures = BlockedStills(), FrameCounts(), smooth_pictures(1, size=SIZE)
-    stills.released.set()
-    with RealtimePace(
-        base_stage(out), stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=counts,
-        stop=out.time, failures=Failures(out.time),
-    ) as pace:  # fmt: skip
-        for index, frame in enumerate(framed(pictures * frames)):
+    with paced(out, BlockedStills()) as pace:
+        for index, frame in enumerate(framed(smooth_pictures(1, size=SIZE) * frames)):
             out.time.pass_s(2.5 / 15 if index % slow == slow - 1 else reading_s)
             pace.step(replace(frame, camera_unit=unit(index)) if coded else frame)
-            assert counts.captured == index + 1
-    return counts
+            assert pace.counts.captured == index + 1
+    return pace.counts
 
 
 @pytest.mark.parametrize("reading_s", [0.1, 0.4, 3.0])
 def test_a_clip_that_cannot_be_read_in_real_time_is_played_slower(reading_s):
     """The delay grew for ever (161 s were seen); or capture times, rates and length would be untrue."""
     frames = 150
-    out = TimedOut(SteppedTime())
+    out = Out()
     counts = play_clip(reading_s=reading_s, frames=frames, out=out)
     took_s = (out.time.now_ns - START_NS) / SECOND_NS
     assert took_s == pytest.approx(frames * reading_s), "nothing waits where all is late"
@@ -213,14 +174,14 @@ def test_a_clip_that_cannot_be_read_in_real_time_is_played_slower(reading_s):
 
 def test_no_unit_of_a_camera_is_left_out_of_a_clip_that_is_read_too_slowly():
     """All that builds on it would be smear, up to the next keyframe."""
-    out = TimedOut(SteppedTime())
+    out = Out()
     play_clip(reading_s=0.1, frames=60, out=out, coded=True)
     assert [one.frame_index for one in out.headers] == list(range(60))
 
 
 def test_a_clip_that_can_be_read_in_real_time_keeps_its_time():
     """A short hiccup would shift all that follows, and the summary would blame the machine."""
-    out = TimedOut(SteppedTime(), blocks_s=lambda count: 0.8 if count == 20 else 0.02)
+    out = Out(lambda count: 0.8 if count == 20 else 0.02)
     counts = play_clip(reading_s=0.03, frames=90, out=out)
     assert counts.paused_ns == 0
     assert {one.capture_ns - START_NS for one in out.headers} <= {round(n * 1e9 / 15) for n in range(90)}
@@ -228,39 +189,26 @@ def test_a_clip_that_can_be_read_in_real_time_keeps_its_time():
 
 def test_a_frame_that_is_dear_to_code_now_and_then_costs_no_other():
     """A keyframe takes six times as long as others: each cost two frames on a board, with half of it idle."""
-    out = TimedOut(SteppedTime())
-    counts = play_clip(reading_s=0.03, frames=120, out=out, slow=40)
-    assert counts.groups == {"sent": 120}
-    often = play_clip(reading_s=0.06, frames=120, out=TimedOut(SteppedTime()), slow=4)
+    assert play_clip(reading_s=0.03, frames=120, out=Out(), slow=40).groups == {"sent": 120}
+    often = play_clip(reading_s=0.06, frames=120, out=Out(), slow=4)
     assert often.dropped_cpu > 20, "a machine that is too slow would gain delay"
 
 
-def keyframes_soon(*, frames: int, due_from_s: float | None = None) -> list[int]:
-    """Frames of a clip at 15 fps after which the detector waits for a keyframe; one is due from that time on."""
-    out, stills, found = TimedOut(SteppedTime()), BlockedStills(), []
-    stills.released.set()
-    base = base_stage(out)
-    if due_from_s is not None:
-        base.keyframes.due = lambda now_ns: now_ns >= START_NS + due_from_s * SECOND_NS
-    with RealtimePace(
-        base, stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=FrameCounts(),
-        stop=out.time, failures=Failures(out.time),
-    ) as pace:  # fmt: skip
+@pytest.mark.parametrize(
+    ("frames", "due_from_s", "waits"), [(160, None, range(146, 150)), (60, 1.0, range(11, 19))]
+)
+def test_the_detector_does_not_begin_just_before_a_keyframe_nor_waits_for_one_for_long(
+    frames, due_from_s, waits
+):
+    """Both together take longer than the frames behind them can wait; for two seconds, boxes were three old."""
+    stills, found = BlockedStills(), []
+    with paced(Out(), stills) as pace:
+        if due_from_s is not None:
+            pace.base.keyframes.due = lambda now_ns: now_ns >= START_NS + due_from_s * SECOND_NS
         for index, frame in enumerate(framed(smooth_pictures(1, size=SIZE) * frames)):
             pace.step(frame)
             found += [index] if stills.analyzer.cpu_budget.keyframe_soon else []
-    return found
-
-
-def test_the_detector_does_not_begin_just_before_a_keyframe():
-    """Both together take longer than the frames behind them can wait."""
-    keyframe = 150
-    assert keyframes_soon(frames=160) == list(range(keyframe - 4, keyframe))
-
-
-def test_a_keyframe_that_waits_for_its_room_does_not_keep_the_detector_for_long():
-    """It may wait for two seconds: boxes were three seconds old."""
-    assert keyframes_soon(frames=60, due_from_s=1.0) == list(range(11, 19))
+    assert found == list(waits)
 
 
 class AskedBudget(CpuBudget):
@@ -271,7 +219,6 @@ class AskedBudget(CpuBudget):
         self.late: list[bool] = []
 
     def admits_frame(self, at_ns, *, lost, late):
-        """Whether perception gets it."""
         self.late.append(late)
         return super().admits_frame(at_ns, lost=lost, late=late)
 
@@ -279,13 +226,9 @@ class AskedBudget(CpuBudget):
 @pytest.mark.parametrize(("waits_s", "reading_s", "late"), [(1 / 15, 0.0, False), (0.0, 1 / 15, True)])
 def test_perception_gives_way_to_a_slow_machine_alone(waits_s, reading_s, late):
     """Where video took all of the budget, each frame waited for its room: an idle machine had no boxes for good."""
-    out, stills = TimedOut(SteppedTime(), lambda count: waits_s if count else 0.12), BlockedStills()
-    stills.released.set()
+    out, stills = Out(lambda count: waits_s if count else 0.12), BlockedStills()
     stills.analyzer.cpu_budget = budget = AskedBudget()
-    with RealtimePace(
-        base_stage(out), stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=FrameCounts(),
-        stop=out.time, failures=Failures(out.time),
-    ) as pace:  # fmt: skip
+    with paced(out, stills) as pace:
         for frame in framed(smooth_pictures(1, size=SIZE) * 60):
             out.time.pass_s(reading_s)
             pace.step(frame)
@@ -294,7 +237,7 @@ def test_perception_gives_way_to_a_slow_machine_alone(waits_s, reading_s, late):
 
 def test_a_clip_behind_a_link_that_stood_still_catches_up():
     """The machine would be called too slow for an outage of the link."""
-    out = TimedOut(SteppedTime(), blocks_s=lambda count: 6.0 if count == 20 else 0.0)
+    out = Out(lambda count: 6.0 if count == 20 else 0.0)
     counts = play_clip(reading_s=0.005, frames=300, out=out)
     assert counts.paused_ns == 0
     delays_ns = [one.send_delay_ns for one in out.headers]
@@ -303,7 +246,6 @@ def test_a_clip_behind_a_link_that_stood_still_catches_up():
 
 
 def unit(index: int, *, keyframe: bool = False, size: int = 1_000) -> AccessUnit:
-    """An access unit."""
     return AccessUnit(index, index, bytes(size), keyframe)
 
 

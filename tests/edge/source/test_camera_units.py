@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import av
 import pytest
 from hypothesis import given
@@ -95,34 +97,22 @@ def test_a_packet_that_breaks_off_is_no_unit(tmp_path, damage):
         CameraUnits(header_of(clip)).unit(damage(packets_of(clip)[0]))
 
 
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return write_clip(tmp_path_factory.mktemp("clip") / "a.mp4")
+
+
 @given(
     header=st.binary(max_size=80),
     packet=st.binary(max_size=200),
     at=st.integers(0, 10**6),
     by=st.integers(0, 255),
 )
-def test_damage_is_a_value_error_and_nothing_else(tmp_path_factory, header, packet, at, by):
+def test_damage_is_a_value_error_and_nothing_else(clip, header, packet, at, by):
     """A damaged file, or a stranger's stream, would end the flight in a traceback."""
-    clip = _clip(tmp_path_factory)
     real_header, real = bytearray(header_of(clip)), bytearray(packets_of(clip)[0])
-    real_header[at % len(real_header)] = by
-    real[at % len(real)] = by
-    for one, other in (
-        (b"\1" + header, packet),
-        (bytes(real_header), bytes(real)),
-        (b"", packet),
-        (header, packet),
-    ):
-        try:
+    real_header[at % len(real_header)] = real[at % len(real)] = by
+    damaged = (bytes(real_header), bytes(real))
+    for one, other in ((b"\1" + header, packet), damaged, (b"", packet), (header, packet)):
+        with suppress(ValueError):
             CameraUnits(one).unit(other)
-        except ValueError:
-            continue
-
-
-_clips = {}
-
-
-def _clip(tmp_path_factory):
-    if "clip" not in _clips:
-        _clips["clip"] = write_clip(tmp_path_factory.mktemp("clip") / "a.mp4")
-    return _clips["clip"]

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from types import SimpleNamespace
+from unittest import mock
 
+import cv2
 import numpy as np
 import pytest
 
 from hvt_common.errors import NotYetError
+from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
+from hvt_edge.source import camera as camera_module
 from hvt_edge.source import live
+from hvt_edge.source.camera import CameraGrabber
 from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.live import CameraClock, LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
@@ -89,8 +94,8 @@ def test_a_camera_that_says_its_time_late_stops_no_picture():
     assert times[-1][0] - times[-1][1] == 3 * SECOND_NS
 
 
-class SaysItsTimeLater:
-    """A camera that says no time until it is opened again, and then that each of its frames is four seconds old."""
+class Camera:
+    """A device that is always there; ``given`` counts its shots, ``now_ns`` is its time."""
 
     name, notes = "cam", None
 
@@ -102,16 +107,21 @@ class SaysItsTimeLater:
 
     restart = close = open  # noqa: A003 - the method above
 
+    def shot(self, at_ns: int | None = None) -> Shot:
+        return Shot(partial(np.zeros, (48, 64, 3), np.uint8), at_ns)
+
+
+class SaysItsTimeLater(Camera):
+    """It says no time until it is opened again, and then that each of its frames is four seconds old."""
+
     def grab(self) -> Shot:
-        """Each fifth of a second; it goes away once, and after sixty for good."""
         if self.given == 60:
             self.ended.set()
             raise SignalLost("it is gone")
         self.given, self.now_ns = self.given + 1, self.now_ns + SECOND_NS // 5
         if self.given == 10:
             raise SignalLost("it went away")
-        at_ns = self.now_ns - 4 * SECOND_NS if self.given > 10 else None
-        return Shot(partial(np.zeros, (48, 64, 3), np.uint8), at_ns)
+        return self.shot(self.now_ns - 4 * SECOND_NS if self.given > 10 else None)
 
 
 def test_a_camera_that_was_away_and_says_other_times_stops_no_picture(quick):
@@ -152,45 +162,35 @@ def test_a_camera_that_goes_away_is_told_of_and_comes_back(free_port, caplog, qu
     assert len(caplog.records) <= 2, "said once, and once that it is back"
 
 
-class Faulty:
-    """A camera whose driver raises one of ``errors`` after each opening, as long as there are some."""
+def broken():
+    raise ValueError("no such layout")
 
-    name, notes = "cam", None
 
-    def __init__(self, *errors: Exception) -> None:
-        self._errors = iter(errors)
-        self._whole = True
-        self.restarts = 0
+class Faulty(Camera):
+    """Its second shot raises ``ValueError``, at once or ``late`` with its picture; each second opening fails too."""
 
-    def open(self) -> None:
-        """It is open."""
+    def __init__(self, *, late: bool) -> None:
+        super().__init__()
+        self.late, self.restarts = late, 0
 
     def restart(self) -> None:
-        """Every second one fails, too."""
         self.restarts += 1
         if self.restarts % 2:
             raise RuntimeError("the driver is not ready")
-        self._whole = True
 
     def grab(self) -> Shot:
-        """A picture at once, and then what goes wrong."""
-        self._whole, whole = False, self._whole
-        if not whole and (error := next(self._errors, None)) is not None:
-            raise error
+        self.given += 1
+        if self.given == 2:
+            return Shot(broken if self.late else broken())
         time.sleep(0.02)
-        return Shot(partial(np.zeros, (48, 64, 3), np.uint8))
-
-    def close(self) -> None:
-        """There is nothing to close."""
+        return self.shot()
 
 
-@pytest.mark.parametrize("where", ["grab", "picture"])
-def test_an_error_that_nobody_expects_of_a_camera_costs_its_pictures_alone(monkeypatch, caplog, quick, where):
+@pytest.mark.parametrize("late", [False, True])
+def test_an_error_that_nobody_expects_of_a_camera_costs_its_pictures_alone(caplog, quick, late):
     """One odd frame of a driver or a decoder would end the flight."""
-    camera, failures, waits = Faulty(ValueError("no such layout")), Failures(time.time_ns), []
-    if where == "picture":
-        monkeypatch.setattr(camera, "grab", raising_pictures(camera.grab))
-    with LiveSource(camera, SourceSettings(size=lambda size: size, fps=25), failures=failures) as source:
+    camera, failures, waits = Faulty(late=late), Failures(time.time_ns), []
+    with LiveSource(camera, SMALL, failures=failures) as source:
         for frame in source.steps(start_ns=0):
             waits += [] if frame is None else [frame.index]
             if source.restarts and len(waits) > 5:
@@ -208,51 +208,22 @@ def test_an_error_that_nobody_expects_of_a_camera_costs_its_pictures_alone(monke
 
 def test_a_camera_whose_first_picture_fails_in_an_odd_way_is_waited_for():
     """A camera that is still starting would end the start with a traceback, and nobody try again."""
-    camera = SimpleNamespace(name="cam", open=lambda: None, grab=lambda: Shot(broken), close=lambda: None)
-
-    def broken():
-        raise ValueError("no such layout")
-
-    with pytest.raises(
-        NotYetError, match=r"cam opens but delivers no picture \(ValueError: no such layout\)"
-    ):
+    camera = Camera()
+    camera.grab = lambda: Shot(broken)
+    says = r"cam opens but delivers no picture \(ValueError: no such layout\)"
+    with pytest.raises(NotYetError, match=says):
         LiveSource(camera, SMALL)
 
 
-def raising_pictures(grab):
-    """The same, where the error comes as late as the conversion of the picture."""
-
-    def late() -> Shot:
-        try:
-            return grab()
-        except ValueError as error:
-            raised = error
-
-        def image():
-            raise raised
-
-        return Shot(image)
-
-    return late
-
-
-class Bursts:
-    """A camera whose frames, 30 a second by its stamps, come so many at a time."""
-
-    name, notes = "cam", None
+class Bursts(Camera):
+    """Its frames, 30 a second by its stamps, come so many at a time, once the first of them is wanted."""
 
     def __init__(self, together: int = 3) -> None:
+        super().__init__()
         self.together = together
-        self.given, self.now_ns = 0, 1_000 * SECOND_NS
         self.come, self.wanted = threading.Semaphore(0), threading.Semaphore(1)
 
-    def open(self) -> None:
-        """It is open."""
-
-    restart = close = open  # noqa: A003 - the method above
-
     def grab(self) -> Shot:
-        """The next; before the first of a burst, once it is wanted."""
         if self.given % self.together == 1 % self.together:  # the source asks for one before it begins
             if self.given > 1:
                 self.come.release()
@@ -260,15 +231,13 @@ class Bursts:
                 raise SignalLost("nobody wants more")
             self.now_ns += self.together * SECOND_NS // 30
         self.given += 1
-        return Shot(partial(np.zeros, (48, 64, 3), np.uint8), self.given * SECOND_NS // 30)
+        return self.shot(self.given * SECOND_NS // 30)
 
 
 def test_frames_that_come_in_bursts_are_all_taken_at_the_times_of_their_stamps():
     """Over UDP through a radio two of three frames would be lost, and the others seem to stand and leap."""
     camera, times = Bursts(), []
-    with LiveSource(
-        camera, SourceSettings(size=lambda size: size, fps=30), clock=lambda: camera.now_ns
-    ) as source:
+    with LiveSource(camera, replace(SMALL, fps=30), clock=lambda: camera.now_ns) as source:
         steps = source.steps(start_ns=0)
         for _ in range(6):
             assert camera.come.acquire(timeout=60), "three have come"
@@ -284,8 +253,7 @@ def test_frames_that_come_in_bursts_are_all_taken_at_the_times_of_their_stamps()
 def test_one_frame_may_wait_beside_the_newest_and_no_second_one_soon():
     """A keyframe takes longer to code than two frames are apart; a machine that is too slow gains no delay."""
     camera, waiting = Bursts(together=1), []
-    settings = SourceSettings(size=lambda size: size, fps=30)
-    with LiveSource(camera, settings, clock=lambda: camera.now_ns) as source:
+    with LiveSource(camera, replace(SMALL, fps=30), clock=lambda: camera.now_ns) as source:
         for _ in range(6):
             camera.wanted.release()
             assert camera.come.acquire(timeout=60)
@@ -323,3 +291,62 @@ def test_a_camera_that_hangs_is_left_behind_with_one_sentence(monkeypatch, caplo
     source.close()
     camera.ended.set()
     assert caplog.text.count("is left behind") == 1
+
+
+LEVELS = np.full((48, 64), 29_900, np.uint16)
+LEVELS[20:30, 20:30] = 30_200
+"""A warm body: both are 116 or 117 of 255 in the upper eight bits."""
+
+
+@pytest.fixture
+def thermal(monkeypatch, tmp_path):
+    """The properties of a V4L2 camera of 16-bit grey, for which OpenCV is a stand-in, and its grabber's maker."""
+    given = {cv2.CAP_PROP_FOURCC: cv2.VideoWriter.fourcc(*"Y16 "), cv2.CAP_PROP_CONVERT_RGB: 1}
+    given |= {cv2.CAP_PROP_FRAME_WIDTH: 64, cv2.CAP_PROP_FRAME_HEIGHT: 48, "raw": LEVELS}
+
+    def retrieve():
+        eight = cv2.cvtColor((LEVELS >> 8).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+        return True, eight if given[cv2.CAP_PROP_CONVERT_RGB] else given["raw"]
+
+    def opened(_number, *, read_s):
+        assert read_s == 4, "two frames of half a frame a second"
+        capture = mock.Mock(get=lambda name: given.get(name, 0), retrieve=retrieve)
+        capture.set = lambda name, value: given.update(
+            {name: value} if name == cv2.CAP_PROP_CONVERT_RGB else {}
+        )
+        return capture
+
+    def grabber(clock) -> CameraGrabber:
+        made = CameraGrabber(str(tmp_path / "video0"), fps=0.5, clock=clock)
+        made.open()
+        return made
+
+    monkeypatch.setattr(camera_module, "opened_capture", opened)
+    monkeypatch.setattr(camera_module.stat, "S_ISCHR", lambda _mode: True)
+    (tmp_path / "video0").touch()
+    return given, grabber
+
+
+@pytest.mark.parametrize("raw", [LEVELS, LEVELS.view(np.uint8).reshape(1, -1)], ids=["levels", "bytes"])
+def test_a_warm_body_is_seen_by_a_thermal_camera(thermal, raw):
+    """It would be one level of 255 above the rest: nobody sees it, and no network."""
+    given, grabber_of = thermal
+    given["raw"], grabber = raw, grabber_of(SteadyClock())
+    picture = grabber.grab().image()
+    assert picture.shape == (48, 64, 3)
+    assert int(picture[25, 25, 0]) - int(picture[5, 5, 0]) > 200
+    (said,) = grabber.notes.taken()
+    assert said.startswith(
+        "its 16-bit grey is a sensor's: levels 29900 to 30200 are stretched to black and white"
+    )
+
+
+def test_a_clock_that_was_set_back_makes_no_picture_old(thermal):
+    """Every picture of a camera that is opened after it would be as old as the step, for the rest of the flight."""
+    given, grabber_of = thermal
+    clock = SteadyClock(wall_ns=lambda: time.time_ns() + 3 * SECOND_NS)  # set back since the start
+    grabber, taken_ns = grabber_of(clock), clock()
+    given[cv2.CAP_PROP_POS_MSEC] = time.monotonic_ns() / 1e6
+    camera_ns = grabber.grab().camera_ns
+    assert camera_ns is not None
+    assert abs(CameraClock().capture_ns(camera_ns, now_ns=clock()) - taken_ns) < SECOND_NS

@@ -18,11 +18,8 @@ rates = st.fractions(min_value=Fraction(1, 2), max_value=240, max_denominator=10
 
 def played(times, fps, *, tail_s, slack_s=Fraction(0)):
     """Hold frames 0, 1, 2 … that were taken at ``times``."""
-    return list(
-        hold(
-            ((t, n) for n, t in enumerate(times)), fps=Fraction(fps), tail_s=Fraction(tail_s), slack_s=slack_s
-        )
-    )
+    stamped = ((t, n) for n, t in enumerate(times))
+    return list(hold(stamped, fps=Fraction(fps), tail_s=Fraction(tail_s), slack_s=slack_s))
 
 
 @given(source=rates, base=rates, count=st.integers(1, 200), start=st.fractions(-5, 5, max_denominator=90_000))
@@ -75,13 +72,9 @@ def test_matroska_milliseconds_do_not_make_frames_slip():
 
 
 def test_time_stamps_that_run_backwards_replace_and_never_rewind():
-    """One broken time stamp would end the clip or play a part of it twice."""
+    """One broken time stamp would end the clip or play a part of it twice; an empty clip would crash."""
     out = played([Fraction(t) for t in ("0", "0.2", "0.1", "0.1", "0.4")], 10, tail_s="0.1")
     assert out == [(0, 0), (1, 0), (2, 3), (3, 3), (4, 4)]
-
-
-def test_one_frame_and_no_frame():
-    """A picture given as a clip would show nothing; an empty clip would crash."""
     assert played([Fraction(3)], 15, tail_s="0.001") == [(0, 0)]
     assert played([], 15, tail_s="0.1") == []
 
@@ -132,24 +125,16 @@ def test_boxes_survive_the_round_trip_between_source_and_base(source, base, fit,
 @pytest.mark.parametrize(
     ("source", "base"),
     [
-        ((1100, 720), (1280, 720)),
-        ((1920, 1080), (1280, 720)),
+        *((source, (1280, 720)) for source in ((1100, 720), (1920, 1080), (720, 1280))),
         ((333, 517), (640, 360)),
-        ((720, 1280), (1280, 720)),
     ],
 )
 def test_the_picture_lies_where_the_view_says(source, base, fit):
     """Every box on the ground would be off by the error of the resizer."""
     resizer = Resizer(source, base, fit=fit)
-    wide, high = source
-    picture = np.zeros((high, wide, 3), np.uint8)
+    picture = np.zeros((*source[::-1], 3), np.uint8)
     # A bright square round the middle third, which both fits keep.
-    x0, y0, x1, y1 = (
-        wide // 2 - wide // 10,
-        high // 2 - high // 10,
-        wide // 2 + wide // 10,
-        high // 2 + high // 10,
-    )
+    x0, y0, x1, y1 = (side // 2 + part * (side // 10) for part in (-1, 1) for side in source)
     picture[y0:y1, x0:x1] = 255
     frame = resizer.frame(picture, index=0, capture_ns=0)
     assert frame.base_bgr.shape == (base[1], base[0], 3)
@@ -177,21 +162,21 @@ def test_fine_texture_is_averaged_and_not_aliased():
     assert frame.base_bgr.std() < 50  # picking single pixels gives about 127
 
 
-def test_pictures_of_another_size_are_told_of_once(caplog):
+@pytest.mark.parametrize(
+    ("sizes", "told"),
+    [
+        ([(64, 48), (640, 480), (640, 480), (64, 48), (640, 480), (48, 64)], ["640x480", "48x64"]),
+        # A folder of photographs, each of a size of its own, wrote a warning for each.
+        ([(wide, 48) for wide in range(64, 96)], ["65x48", "66x48", "67x48"]),
+    ],
+)
+def test_pictures_of_another_size_are_told_of_once(caplog, sizes, told):
     """A stream that begins small, or a folder with a thumbnail in front, was small to its end without a word."""
     resizer = Resizer((64, 48), (64, 48), fit="letterbox", name="cam")
-    for index, size in enumerate([(64, 48), (640, 480), (640, 480), (64, 48), (640, 480), (48, 64)]):
+    for index, size in enumerate(sizes):
         resizer.frame(np.full((*size[::-1], 3), index, np.uint8), index=index, capture_ns=index)
     said = [record.message.partition(",")[0] for record in caplog.records]
-    assert said == ["cam: a picture is 640x480", "cam: a picture is 48x64"]
-
-
-def test_not_every_size_is_told(caplog):
-    """A folder of photographs, each of a size of its own, wrote a warning for each."""
-    resizer = Resizer((64, 48), (64, 48), fit="letterbox")
-    for wide in range(64, 96):
-        resizer.frame(np.zeros((48, wide, 3), np.uint8), index=0, capture_ns=0)
-    assert sum("a picture is" in one.message for one in caplog.records) == 3
+    assert said == [f"cam: a picture is {size}" for size in told]
 
 
 def test_broadcast_rates_are_exact():

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import NotYetError, UserError
-from hvt_edge.source import coded_live, stream
-from hvt_edge.source.coded_live import CodedStreamGrabber
+from hvt_edge.source import coded, stream
+from hvt_edge.source.coded import CodedStreamGrabber
 from hvt_edge.source.live import SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.stream import StreamGrabber
@@ -41,19 +41,28 @@ def film_that_stops(*, pictures: int = 10, tones: int = 200, **options: str) -> 
     return data
 
 
-@pytest.mark.parametrize("grabber", [StreamGrabber, CodedStreamGrabber])
-def test_a_camera_of_which_sound_alone_goes_on_has_stopped(monkeypatch, grabber):
-    """It would never be opened again: where a camera's encoder hangs, its microphone or its telemetry does not."""
+@pytest.fixture
+def quarters(monkeypatch):
+    """Each look at the clock takes a quarter of a second."""
     seconds = itertools.count()
-    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
-    connection = av.open(film_that_stops())
-    monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)
-    camera = grabber("tcp://camera")
+    for module in (stream, coded):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
+
+
+def stops(grabber, url: str, says: str) -> None:
+    camera = grabber(url)
     camera.open()
-    assert camera.grab()
-    with pytest.raises(SignalLost, match="no picture"):
+    with pytest.raises(SignalLost, match=says):
         all(iter(camera.grab, None))
     camera.close()
+
+
+@pytest.mark.parametrize("grabber", [StreamGrabber, CodedStreamGrabber])
+def test_a_camera_of_which_sound_alone_goes_on_has_stopped(monkeypatch, grabber, quarters):
+    """It would never be opened again: where a camera's encoder hangs, its microphone or its telemetry does not."""
+    connection = av.open(film_that_stops())
+    monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)
+    stops(grabber, "tcp://camera", "no picture")
 
 
 def test_a_stream_that_comes_in_segments_is_played_by_its_own_time(tmp_path, monkeypatch):
@@ -70,21 +79,14 @@ def test_a_stream_that_comes_in_segments_is_played_by_its_own_time(tmp_path, mon
             output.mux(film.encode(av.VideoFrame(128, 64, "yuv420p")))
         output.mux(film.encode(None))
     with av.open(str(tmp_path / "a.m3u8")) as live:
-        came_s = [now_s[0] for packet in stream.packets_of(live, live.streams.video[0]) if packet.size]
+        came_s = [now_s[0] for packet in stream.live_packets_of(live, live.streams.video[0]) if packet.size]
     assert came_s == pytest.approx([number / 25 for number in range(30)])
 
 
-def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(tmp_path, monkeypatch):
+def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(quarters):
     """It was dark for ever: PyAV passes over each packet of it, and waits for more of the one before."""
-    seconds = itertools.count()
-    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
-    one, other = (
-        film_that_stops(pictures=100, tones=0, **options).getvalue()
-        for options in (
-            {},
-            {"mpegts_service_id": "7", "mpegts_pmt_start_pid": "496", "mpegts_start_pid": "300"},
-        )
-    )
+    another = {"mpegts_service_id": "7", "mpegts_pmt_start_pid": "496", "mpegts_start_pid": "300"}
+    one, other = (film_that_stops(pictures=100, tones=0, **options).getvalue() for options in ({}, another))
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def send():
@@ -94,21 +96,13 @@ def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(tmp_path, m
 
         sender = threading.Thread(target=send)
         sender.start()
-        camera = StreamGrabber(f"tcp://127.0.0.1:{server.getsockname()[1]}")
-        camera.open()
-        with pytest.raises(SignalLost, match="no picture"):
-            all(iter(camera.grab, None))
-        camera.close()
+        stops(StreamGrabber, f"tcp://127.0.0.1:{server.getsockname()[1]}", "no picture")
         sender.join()
 
 
 @pytest.mark.parametrize(("grabber", "codec"), [(StreamGrabber, "libx264"), (CodedStreamGrabber, "libx265")])
-def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch, grabber, codec):
+def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch, grabber, codec, quarters):
     """The edge waited for ever, without a word: H.264 without its keyframe is no error to FFmpeg."""
-    seconds = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(seconds) / 4)
-    monkeypatch.setattr(stream, "time", clock)
-    monkeypatch.setattr(coded_live, "time", clock)
     data = io.BytesIO()
     with av.open(data, "w", format="matroska") as output:
         film = output.add_stream(codec, rate=25, options={"tune": "zerolatency", "g": "1000"})
@@ -121,11 +115,7 @@ def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch, grabber, c
         output.mux(packets[1:])
     connection = av.open(io.BytesIO(data.getvalue()))
     monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)
-    camera = grabber("tcp://camera")
-    camera.open()
-    with pytest.raises(SignalLost, match="does a keyframe come"):
-        all(iter(camera.grab, None))
-    camera.close()
+    stops(grabber, "tcp://camera", "does a keyframe come")
 
 
 @pytest.mark.parametrize("coded", [False, True])
@@ -175,21 +165,18 @@ def test_a_camera_has_as_long_when_it_is_opened_again(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "address", ["udp://5600", "udp://:5600x", "udp://0.0.0.0:99999", "rtp://[::1]", "tcp://a"]
+    ("lacks", "addresses"),
+    [
+        ("port: give", "udp://5600 udp://:5600x udp://0.0.0.0:99999 rtp://[::1] tcp://a"),
+        ("port: give", "udp://127.0.0.1?localport=99999"),
+        ("host: give one", "rtsp:// rtsp:///stream1 http://:80/video RTMP://user:word@/live"),
+    ],
 )
-def test_a_stream_without_a_port_is_refused(address):
-    """FFmpeg took 99999 or no number at all for a port, and the edge waited for ever where nobody could send."""
-    with pytest.raises(UserError, match="names no port: give"):
-        open_source(address, size=(320, 180), fps=15)
-
-
-@pytest.mark.parametrize(
-    "address", ["rtsp://", "rtsp:///stream1", "http://:80/video", "RTMP://user:word@/live"]
-)
-def test_a_stream_without_a_host_is_refused(address):
-    """A script whose variable is empty writes it: the edge asked its own machine for the camera for ever."""
-    with pytest.raises(UserError, match="names no host: give one"):
-        open_source(address, size=(320, 180), fps=15)
+def test_a_stream_without_a_port_or_host_is_refused(lacks, addresses):
+    """FFmpeg took 99999 or no number at all for a port, and asked this machine for the camera, for ever."""
+    for address in addresses.split():
+        with pytest.raises(UserError, match=f"names no {lacks}"):
+            open_source(address, size=(320, 180), fps=15)
 
 
 def test_a_protocol_that_pyav_lacks_is_said_with_a_way_round(monkeypatch):
@@ -200,22 +187,20 @@ def test_a_protocol_that_pyav_lacks_is_said_with_a_way_round(monkeypatch):
         open_source("srt://camera:9000", size=(320, 180), fps=15)
 
 
-@pytest.mark.parametrize("scheme", ["RTSP", "Http", "UDP"])
-def test_a_scheme_in_capitals_is_the_same(monkeypatch, scheme):
-    """FFmpeg knows no RTSP://, which a phone's keyboard writes: the camera was refused (RFC 3986, 3.1)."""
-    opened = []
-    monkeypatch.setattr(StreamGrabber, "open", lambda self: opened.append(self.name) or 1 / 0)
+@pytest.mark.parametrize(
+    ("given", "opened"),
+    [
+        *(
+            (f"{one}://127.0.0.1:5600/", f"{one.lower()}://127.0.0.1:5600/")
+            for one in ("RTSP", "Http", "UDP")
+        ),
+        ("udp://127.0.0.1?pkt_size=1316&localport=5600", "udp://127.0.0.1?…"),
+    ],
+)
+def test_a_scheme_in_capitals_and_a_port_to_listen_on_are_taken(monkeypatch, given, opened):
+    """FFmpeg knows no RTSP://, which a phone's keyboard writes (RFC 3986, 3.1), and listens on ?localport=."""
+    seen = []
+    monkeypatch.setattr(StreamGrabber, "open", lambda self: seen.append(self.name) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        open_source(f"{scheme}://127.0.0.1:5600/", size=(320, 180), fps=15)
-    assert opened == [f"{scheme.lower()}://127.0.0.1:5600/"]
-
-
-def test_a_port_to_listen_on_is_one(monkeypatch):
-    """FFmpeg listens on ?localport= of udp://, and the edge refused the address for want of a port."""
-    opened = []
-    monkeypatch.setattr(StreamGrabber, "open", lambda self: opened.append(self.name) or 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        open_source("udp://127.0.0.1?pkt_size=1316&localport=5600", size=(320, 180), fps=15)
-    with pytest.raises(UserError, match="names no port: give"):
-        open_source("udp://127.0.0.1?localport=99999", size=(320, 180), fps=15)
-    assert len(opened) == 1
+        open_source(given, size=(320, 180), fps=15)
+    assert seen == [opened]

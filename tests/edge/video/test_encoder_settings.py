@@ -22,11 +22,10 @@ KEYFRAMES = (20, 46, 95, 125)
 """A second or more apart."""
 
 
-def asked(base_bps: int, total_bps: int) -> EncoderSettings:
+def asked(base_bps: int, total_bps: int, *, fps: float = FPS) -> EncoderSettings:
     """The encoder's settings for a budget."""
-    return encoder_settings(
-        size=SIZE, fps=FPS, preset="veryfast", total_bps=total_bps, base_bps=base_bps, edge_id="edge-1"
-    )
+    rates = {"total_bps": total_bps, "base_bps": base_bps}
+    return encoder_settings(size=SIZE, fps=fps, preset="veryfast", edge_id="edge-1", **rates)
 
 
 def line_bits(pictures, settings: EncoderSettings, *, keyframes=KEYFRAMES) -> list[int]:
@@ -82,24 +81,16 @@ def test_the_least_share_leaves_x265_its_minimum():
 
 def test_the_least_share_is_kept():
     """The smallest budget that is accepted would be overspent in every second."""
-    size, count = (640, 360), 150
-    least = least_base_bps(size, FPS, edge_id="edge-1")
-    settings = encoder_settings(
-        size=size, fps=FPS, preset="veryfast", total_bps=2 * least, base_bps=least, edge_id="edge-1"
-    )
-    assert (
-        sum(line_bits(hard_pictures(count, size=size), settings, keyframes=(100,))) / (count / FPS)
-        <= 1.05 * least
-    )
+    least = least_base_bps(SIZE, FPS, edge_id="edge-1")
+    bits = line_bits(hard_pictures(150, size=SIZE), asked(least, 2 * least), keyframes=(100,))
+    assert sum(bits) / (150 / FPS) <= 1.05 * least
 
 
 @pytest.mark.parametrize("decimation", [3, 5])
 def test_fewer_frames_leave_more_for_each_and_keep_the_share(decimation):
     """With ``--fps auto`` the base would overspend, or waste what headers no longer take."""
     fps = FPS / decimation
-    settings = encoder_settings(
-        size=SIZE, fps=fps, preset="veryfast", total_bps=150_000, base_bps=120_000, edge_id="edge-1"
-    )
+    settings = asked(120_000, 150_000, fps=fps)
     assert settings.bitrate_bps > asked(120_000, 150_000).bitrate_bps + 3_000
     assert settings.vbv_s * fps >= 1.1, "with a VBV of one frame x265 leaves a third of the rate unused"
     pictures = hard_pictures(210, size=SIZE)[::decimation]

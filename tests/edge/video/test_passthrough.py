@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import accumulate, pairwise, product
 from pathlib import Path
 from typing import cast
 
@@ -12,15 +12,27 @@ import av
 import pytest
 
 from hvt_archive.local_copy import LocalCopy
+from hvt_common.errors import UserError
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Failures
-from hvt_common.units import SECOND_NS
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.stage import BacklogStage, State
-from hvt_edge.operating import Keyframes, KeyframeSettings
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.operating import Keyframes, KeyframeSettings, base_rate_bps
+from hvt_edge.source.contract import CameraStream, SeenUnit
 from hvt_edge.source.opening import open_source
-from hvt_edge.video.encoders.passthrough import Passthrough
-from hvt_edge.video.passthrough import PassthroughStage
+from hvt_edge.video.passthrough import (
+    FullestWindow,
+    LeastLink,
+    Passthrough,
+    PassthroughStage,
+    about_keyframes,
+    check_camera,
+    measure_camera,
+    needed_bps,
+)
+from hvt_edge.video.qualification import allowed, line_bytes
 from media.clips import START_NS, hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, write_clip
 from rigs import keeping
@@ -30,15 +42,7 @@ from rigs.world import Puts, make_transmitter
 class Rig:
     """A stage with all that it needs, without a store; ``paused_ns`` counts what it has waited."""
 
-    def __init__(
-        self,
-        *,
-        budget_bps: int = 800_000,
-        admits=lambda _now_ns, *_size: True,
-        holder=lambda _now_ns: "budget",
-        copy=None,
-        waits=True,
-    ) -> None:
+    def __init__(self, *, budget_bps: int = 800_000, waits: bool = True, **parts) -> None:
         self.kept, self.failures, self.ledger = Puts(), Failures(time.time_ns), Ledger()
         self.now_ns = START_NS
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=2.0))
@@ -52,14 +56,11 @@ class Rig:
                 wait_until=lambda at_ns: self.wait(at_ns - self.now_ns),
             ),
             failures=self.failures,
-            admits=admits,
-            holder=holder,
-            local_copy=copy,
             pause=self.wait if waits else None,
+            **parts,
         )
 
     def wait(self, pause_ns: int) -> int:
-        """Time goes by."""
         self.now_ns += max(0, pause_ns)
         return self.now_ns
 
@@ -76,7 +77,6 @@ class Rig:
         return sent
 
     def worst_bps(self) -> int:
-        """The fullest second."""
         return self.ledger.summary(6.0).worst_window_bps.total
 
 
@@ -125,7 +125,6 @@ class Store:
     state, segment_open, probes = LIVE, True, False
 
     def probe_due(self, _now_ns: int) -> bool:
-        """As the table says."""
         return self.probes
 
     def resume(self) -> None:
@@ -193,12 +192,9 @@ def test_what_breaks_the_budget_is_left_out_up_to_the_next_keyframe(burst, waits
 def test_a_unit_that_no_window_holds_costs_no_time(burst):
     """The loop would wait for what never comes, and every frame behind it."""
     rig = Rig(budget_bps=20_000)
-    large = [frame for frame in burst[35:50] if len(frame.camera_unit.data) > 3000]
-    began_ns = large[0].capture_ns
-    rig.now_ns = began_ns
-    keyed = [replace(one, camera_unit=replace(one.camera_unit, keyframe=True)) for one in large[:1]]
-    assert rig.play(keyed) == []
-    assert rig.now_ns == began_ns
+    large = next(frame for frame in burst[35:50] if len(frame.camera_unit.data) > 3000)
+    assert rig.play([replace(large, camera_unit=replace(large.camera_unit, keyframe=True))]) == []
+    assert rig.now_ns == large.capture_ns
 
 
 def test_a_link_that_is_busy_for_a_moment_costs_nothing(burst):
@@ -213,29 +209,25 @@ def test_a_link_that_is_busy_for_a_moment_costs_nothing(burst):
     )
     sent = busy.play(burst)
     assert sent[:5] == list(range(5))
-    assert 45 in sent
-    assert 20 not in sent
+    assert (20 in sent, 45 in sent) == (False, True)
     assert "the link has no room for" in busy.failures.parts[0].reason
 
 
 def test_a_frame_that_the_source_lost_is_waited_for_to_be_made_good(burst):
     """What builds on it is garbage everywhere, and nobody would say so."""
-    rig = Rig()
-    sent = rig.play([frame for frame in burst if frame.index not in (20, 21)])
+    sent = Rig().play([frame for frame in burst if frame.index not in (20, 21)])
     assert sent == [*range(20), *range(30, 90)]
 
 
 def test_the_local_copy_has_what_was_not_sent(burst, tmp_path):
     """The only whole copy of the flight would have the holes of the link."""
-    failures = Failures(time.time_ns)
-    with LocalCopy(tmp_path / "copy.mkv", failures=failures, wait=True) as copy:
-        rig = Rig(budget_bps=200_000, copy=copy)
+    with LocalCopy(tmp_path / "copy.mkv", failures=Failures(time.time_ns), wait=True) as copy:
+        rig = Rig(budget_bps=200_000, local_copy=copy)
         sent = rig.play([frame for frame in burst if frame.index != 5])
     assert len(sent) < 80
     with av.open(str(tmp_path / "copy.mkv")) as container:
-        assert sum(1 for _ in container.decode(video=0)) == 90 - 10, (
-            "from the lost one up to the next keyframe"
-        )
+        whole = len(list(container.decode(video=0)))
+    assert whole == 90 - 10, "all but from the lost one up to the next keyframe"
 
 
 def test_a_ground_that_asks_for_a_keyframe_is_told_when_one_comes(burst):
@@ -256,14 +248,8 @@ def test_an_outage_is_stored_from_keyframe_to_keyframe(tmp_path):
     """What is kept while the link is away could not be shown, or what follows be garbage at the ground."""
     frames = frames_of(tmp_path, smooth_pictures(90, size=SIZE), keyint=15)
     rig = keeping.Rig(tmp_path / "store")
-    rig.stage = PassthroughStage(
-        Passthrough(),
-        keyframes=rig.keyframes,
-        transmitter=rig.sender,
-        failures=rig.failures,
-        admits=rig.admits,
-        backlog=rig.backlog,
-    )
+    parts = {"keyframes": rig.keyframes, "transmitter": rig.sender, "failures": rig.failures}
+    rig.stage = PassthroughStage(Passthrough(), **parts, admits=rig.admits, backlog=rig.backlog)
     for frame in frames:
         rig.now_ns, rig.linked = frame.capture_ns, not 35 <= frame.index < 62
         rig.link_control.before_frame(rig.now_ns)
@@ -277,3 +263,94 @@ def test_an_outage_is_stored_from_keyframe_to_keyframe(tmp_path):
     for index in range(45, 75):
         assert kept[index].data == frames[index].camera_unit.data
         assert decoder.decode(kept[index].data) is not None
+
+
+WHOLE = {"window_s": 1.0, "edge_id": "edge-1"}
+
+
+def stream_of(sizes: list[int], gaps_s: list[float], keyframes: set[int]) -> CameraStream:
+    """A camera that sends units of these sizes at these distances."""
+    times = accumulate(gaps_s[: len(sizes) - 1], initial=0.0)
+    pairs = enumerate(zip(times, sizes, strict=True))
+    return CameraStream(
+        tuple(SeenUnit(at_s, size, index in keyframes) for index, (at_s, size) in pairs), 15.0
+    )
+
+
+def test_the_fullest_window_is_any_window_by_the_cameras_times():
+    """A camera that bunches its frames would be taken for one that does not."""
+    sizes = [5000, *[100] * 9, 5000, *[100] * 9]
+    key, other = (line_bytes(size, "edge-1") for size in (5000, 100))
+    even = measure_camera(stream_of(sizes, [0.25] * 20, {0, 10}), **WHOLE)
+    assert even.window_bytes == key + 3 * other
+    assert even.keyframe_bytes == key
+    bunched = measure_camera(stream_of(sizes, [0.25] * 5 + [0.01] * 14, {0, 10}), **WHOLE)
+    assert bunched.window_bytes == key + 17 * other, "all but the first two"
+
+
+def test_a_camera_that_takes_too_much_is_refused_with_its_figure(tmp_path):
+    """Most of its pictures would be left out, and nobody say why."""
+    clip = write_clip(tmp_path / "a.mp4", hard_pictures(45, size=SIZE), more="qp=30")
+    with open_source(str(clip), size=SIZE, fps=15, coded=True) as source:
+        stream = source.camera_stream
+    takes_bps = 8 * measure_camera(stream, **WHOLE).window_bytes
+
+    def check(budget_bps: int) -> str:
+        limit = allowed(size=SIZE, fps=15, total_bps=budget_bps, base_bps=budget_bps, window_s=1.0)
+        return check_camera("cam", stream, limit, budget_bps=budget_bps, edge_id="edge-1")
+
+    assert check(round(1.01 * takes_bps)).startswith("source cam is passed through: 15 fps, ")
+    too_little = round(0.99 * takes_bps)
+    with pytest.raises(UserError) as caught:
+        check(too_little)
+    said, left = str(caught.value), bitrate_text(too_little)
+    assert said.startswith(f"source cam makes {bitrate_text(takes_bps)} in its fullest 1 s (")
+    assert f"--budget {left} leaves {left} for it: re-encode it with --encoder x265" in said
+
+
+def test_a_camera_with_few_keyframes_is_told_of():
+    """A ground that joins would wait for a picture, and the operator for an explanation."""
+    rare = stream_of([100] * 60, [0.1] * 60, {0})
+    assert "goes 6 s without a keyframe" in about_keyframes("cam", rare)
+    assert about_keyframes("cam", stream_of([100] * 60, [0.1] * 60, {0, 20, 40})) == ""
+
+
+@pytest.mark.parametrize("share", [1.0, 0.85, 0.5])
+@pytest.mark.parametrize("metadata_bps", [0, 40_000])
+def test_what_is_needed_has_room_for_the_fullest_window(share, metadata_bps):
+    """A floor that is a little too low is as bad as none: what follows a keyframe would never go out."""
+    sizes = [15_000, *[1200] * 24]
+    total_bps = needed_bps(sum(sizes), window_s=1.0, share=share, metadata_bps=metadata_bps)
+    base_bps = base_rate_bps(total_bps, share, metadata_bps=metadata_bps)
+    budget = RollingBudget(BudgetSettings(total_bps, base_bps, fps=25))
+    for index, size in enumerate(sizes * 3):
+        now_ns = index * SECOND_NS // 25
+        assert budget.earliest_ns(size, now_ns=now_ns, base=True) == now_ns
+        assert budget.fits(size, now_ns=now_ns)
+        budget.record_base(size, now_ns=now_ns)
+
+
+def test_a_clock_that_is_set_back_makes_no_window_fuller():
+    """The camera would be refused for what it does not take."""
+    window = FullestWindow(SECOND_NS)
+    held = [
+        window.add(100, at_ns=at_ns) for at_ns in (0, SECOND_NS // 2, SECOND_NS, -SECOND_NS, -SECOND_NS // 2)
+    ]
+    assert held == [100, 200, 200, 100, 200]
+    assert window.most_bytes == 200
+
+
+def test_a_link_is_free_when_all_is_reported_or_had_its_time():
+    """A queue would grow on a thin link, or a link that has lost something be waited for."""
+    unreported = [0]
+    least = LeastLink(100_000, unreported_bytes=lambda: unreported[0])
+    for number in range(1, 100):  # reports follow some way behind: what they name waits no more
+        unreported[0] = min(12_500, number * 1250)
+        least.sent(1250, now_ns=number)
+    assert not least.is_free(SECOND_NS // 2)
+    assert least.is_free(2 * SECOND_NS), "as long as for what is not reported, not for all"
+    least.sent(12_500, now_ns=2 * SECOND_NS)
+    unreported[0] = 25_000
+    assert not least.is_free(2 * SECOND_NS)
+    unreported[0] = 0
+    assert least.is_free(2 * SECOND_NS)

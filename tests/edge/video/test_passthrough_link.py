@@ -15,8 +15,7 @@ from hvt_common.values import CameraUnit, Frame
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_edge.source.contract import CameraStream, SeenUnit
-from hvt_edge.video.encoders.passthrough import Passthrough
-from hvt_edge.video.passthrough import PassthroughStage
+from hvt_edge.video.passthrough import Passthrough, PassthroughStage
 from hvt_edge.wiring.link import make_budget, make_camera_rates, make_least_link, make_pacer
 from media.clips import START_NS
 from rigs.messages import counted, feedback
@@ -84,7 +83,6 @@ class Flight:
         self._first = True
 
     def admits(self, now_ns: int, _line_bytes: int, _coding_ns: int) -> bool:
-        """As `LinkControl`."""
         if self.pacer is None:
             return True
         return self.pacer.admits_base(now_ns) and self.transmitter.base_wait_ns(now_ns) <= SECOND_NS // 10

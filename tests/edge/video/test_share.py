@@ -16,7 +16,6 @@ from hvt_edge.video.reconfigure import EncoderReconfiguration, Split
 from rigs.examples import candidate, decision_step
 
 SECOND = 1_000_000_000
-BOUNDS = {"size": (1280, 720), "nominal_fps": 15, "least_fps": 2, "edge_id": "e", "min_budget_bps": 50_000}
 
 
 def moment(seconds: float, *, from_source: bool = False) -> Step:
@@ -42,66 +41,64 @@ def split(total_bps: int, **changes) -> Split:
     return Split(total_bps=total_bps, least_base_bps=90_000, **changes)
 
 
-def after(
-    one: Split, scene: list[Candidate], *, seconds: float = 10, start: float = 0, **kind
-) -> float | None:
-    """What is proposed when the scene was like that for some seconds, three steps a second."""
+def crowd(count: int, *, side: float = 90, **changes) -> list[Candidate]:
+    """Tracks of which the base has lost most."""
+    return [car(number, side=side, **({"lost": 0.9} | changes)) for number in range(1, count + 1)]
+
+
+def after(one: Split, scene: list[Candidate], *, seconds: float = 10, start: float = 0, **kind) -> float:
+    """What is proposed when the scene was like that for some seconds, three steps a second; 0 for no change."""
     for number in range(round(seconds * 3)):
         one.observe(scene, moment(start + number / 3, **kind))
-    return one.propose()
+    return one.propose() or 0.0
+
+
+def reconfiguration_of(operating: Operating, its_split: Split, open_encoder) -> EncoderReconfiguration:
+    return EncoderReconfiguration(
+        operating,
+        size=(1280, 720),
+        nominal_fps=15,
+        least_fps=2,
+        edge_id="e",
+        min_budget_bps=50_000,
+        metadata_bps=its_split.metadata_bps,
+        open_encoder=open_encoder,
+        budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
+        split=its_split,
+    )
 
 
 def test_an_empty_scene_gives_the_bits_to_the_base_and_a_crowd_to_stills():
     """Bits would lie idle where nothing is to refine, or a crowd of blurs would stay one."""
     assert after(split(300_000), []) == 0.95
-    crowd = [car(number, lost=0.9, side=90) for number in range(1, 60)]
-    assert after(split(300_000), crowd, from_source=True) == 0.65
-    few = after(split(300_000), crowd[:8], from_source=True)
-    assert few is not None
-    assert 0.85 < few < 0.95
+    assert after(split(300_000), crowd(59), from_source=True) == 0.65
+    assert 0.85 < after(split(300_000), crowd(8), from_source=True) < 0.95
 
 
 def test_settled_tracks_give_their_bits_back():
     """The base would stay poor for the sake of classes that are already known."""
-    one = split(300_000)
-    crowd = [car(number, lost=0.9, side=90) for number in range(1, 60)]
-    assert after(one, crowd, from_source=True) == 0.65
-    known = [
-        replace(
-            track,
-            sent_count=1,
-            last_sent_ns=10 * SECOND,
-            last_sent_area_px=track.area_px,
-            posterior=ClassPosterior("car", 0.97, 0.1),
-        )
-        for track in crowd
-    ]
+    one, scene = split(300_000), crowd(59)
+    assert after(one, scene, from_source=True) == 0.65
+    sent = {"sent_count": 1, "last_sent_ns": 10 * SECOND, "posterior": ClassPosterior("car", 0.97, 0.1)}
+    known = [replace(track, last_sent_area_px=track.area_px, **sent) for track in scene]
     share = after(one, known, start=10, seconds=8, from_source=True)
-    assert share is not None
     assert share > 0.8
     assert one.share == share
 
 
 def test_at_a_thin_rate_the_base_keeps_what_it_needs_to_show_objects():
     """At 150 kbps every bit taken from a base that still shows its cars costs more cars than stills give back."""
-    seen = [car(number, lost=0.2, confidence=0.75, side=60) for number in range(1, 60)]
-    share = after(split(150_000), seen)
-    assert share is not None
-    assert share * 150_000 > 140_000
+    assert after(split(150_000), crowd(59, lost=0.2, confidence=0.75, side=60)) * 150_000 > 140_000
     # A base that shows none of its objects has nothing to lose: down to what x265 can follow.
-    blind = [car(number, lost=0.98, confidence=0.5, side=12) for number in range(1, 200)]
-    share = after(split(150_000), blind, from_source=True)
-    assert share is not None
-    assert 90_000 <= share * 150_000 < 110_000
+    blind = crowd(199, lost=0.98, confidence=0.5, side=12)
+    assert 90_000 <= after(split(150_000), blind, from_source=True) * 150_000 < 110_000
 
 
 def test_the_tracks_channel_comes_out_of_the_total():
     """Base, stills and tracks together would be promised more than there is."""
     assert after(split(200_000, metadata_bps=10_000), []) == 0.9
-    crowd = [car(number, lost=0.95) for number in range(1, 90)]
-    share = after(split(200_000, metadata_bps=10_000), crowd, from_source=True)
-    assert share is not None
-    assert 1 - share - 0.05 <= 0.35 + 1e-9
+    share = after(split(200_000, metadata_bps=10_000), crowd(89, lost=0.95, side=30), from_source=True)
+    assert 0 < 1 - share - 0.05 <= 0.35 + 1e-9
 
 
 def test_nothing_is_proposed_before_the_scene_is_known_or_for_a_trifle():
@@ -109,11 +106,10 @@ def test_nothing_is_proposed_before_the_scene_is_known_or_for_a_trifle():
     one = split(300_000)
     assert one.propose() is None
     assert one.share == FIRST_SHARE
-    scene = [car(number, lost=0.9, side=60) for number in range(1, 51)]
-    after(one, scene, from_source=True)
+    after(one, crowd(50, side=60), from_source=True)
     settled = one.share
-    assert after(one, scene[:-2], start=10, from_source=True) is None
-    assert after(one, [*scene, car(99, lost=0.9, side=60)], start=20, from_source=True) is None
+    for start, count in ((10, 48), (20, 51)):
+        assert after(one, crowd(count, side=60), start=start, from_source=True) == 0
     assert one.share == settled
 
 
@@ -130,29 +126,26 @@ def test_nothing_is_proposed_before_the_scene_is_known_or_for_a_trifle():
 def test_the_share_is_the_same_every_time_and_leaves_x265_what_it_needs(total, metadata, scenes):
     """A flight could not be repeated, or would end because x265 cannot follow its rate."""
 
-    def flight() -> list[float | None]:
+    def flight() -> list[float]:
         one, shares = split(total, metadata_bps=metadata), []
         for number, (count, lost, confidence, source) in enumerate(scenes):
-            scene = [car(track, lost=lost, confidence=confidence) for track in range(1, count + 1)]
+            scene = crowd(count, side=30, lost=lost, confidence=confidence)
             shares.append(after(one, scene, seconds=2, start=2 * number, from_source=source))
         return shares
 
     shares = flight()
     assert flight() == shares
-    for share in shares:
-        if share is not None:
-            assert 0 < share <= 1
-            assert share * total >= min(90_000, total - metadata) - 0.005 * total - 1
-            assert share <= 1 - metadata / total + 0.005
-            assert share == pytest.approx(round(share, 2))
+    for share in filter(None, shares):
+        assert min(90_000, total - metadata) - 0.005 * total - 1 <= share * total
+        assert 0 < share <= min(1, 1 - metadata / total + 0.005)
+        assert share == pytest.approx(round(share, 2))
 
 
 def test_a_scene_that_has_changed_is_worth_a_keyframe_of_its_own_now_and_then():
     """On a thin link scheduled keyframes are a minute apart: the split would follow the scene of a minute ago."""
     one = split(300_000)
     assert not one.wants_keyframe(60 * SECOND), "nothing is known of the scene"
-    crowd = [car(number, lost=0.9, side=90) for number in range(1, 60)]
-    one.observe(crowd, moment(0, from_source=True))
+    one.observe(crowd(59), moment(0, from_source=True))
     assert not one.wants_keyframe(19 * SECOND), "not so soon"
     assert one.wants_keyframe(20 * SECOND)
     assert one.propose() == 0.65
@@ -189,14 +182,7 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
     """With half the frames the base would take all that stills leave, and each would arrive late."""
     operating = Operating(budget_bps=300_000, video_share=None, base_bps=300_000, method="M6", decimation=1)
     opened = []
-    reconfiguration = EncoderReconfiguration(
-        operating,
-        **BOUNDS,
-        metadata_bps=0,
-        open_encoder=opened.append,
-        budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
-        split=split(300_000, most_sparse_share=0.9),
-    )
+    reconfiguration = reconfiguration_of(operating, split(300_000, most_sparse_share=0.9), opened.append)
     operating.decide(AutoDecisions(stills=False))
     reconfiguration.split.observe([], moment(0))
     for decimation, share in ((2, 0.9), (1, 1.0)):
@@ -207,17 +193,13 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
 def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     """A tenth of a thin link would lie idle until the next scheduled keyframe, up to a minute later."""
     operating = Operating(budget_bps=300_000, video_share=None, base_bps=255_000, method="M6", decimation=2)
-    reconfiguration = EncoderReconfiguration(
+    reconfiguration = reconfiguration_of(
         operating,
-        **BOUNDS,
-        metadata_bps=8_000,
-        open_encoder=lambda _rates: pytest.fail("only a keyframe opens it"),
-        budget=None,
-        split=split(300_000, metadata_bps=8_000),
+        split(300_000, metadata_bps=8_000),
+        lambda _rates: pytest.fail("only a keyframe opens it"),
     )
-    crowd = [car(number, lost=0.9, side=90) for number in range(1, 9)]
     for number in range(60):
-        reconfiguration.split.observe(crowd, moment(number / 3, from_source=True))
+        reconfiguration.split.observe(crowd(8), moment(number / 3, from_source=True))
     assert not reconfiguration.wants_keyframe(30 * SECOND)
     operating.decide(AutoDecisions(stills=False))
     assert reconfiguration.wants_keyframe(30 * SECOND)

@@ -6,6 +6,7 @@ import sys
 import time
 import weakref
 from dataclasses import replace
+from itertools import product
 
 import av
 import cv2
@@ -18,13 +19,15 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.backlog.stage import State
 from hvt_edge.config import EdgeConfig, check, least_budget_bps
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.operating import Keyframes, KeyframeSettings, Rates
 from hvt_edge.video.encoder import CheckedEncoder, Encoder, EncoderPlan, EncoderSettings, encoder_settings
-from hvt_edge.video.encoders.hardware import HardwareEncoder
+from hvt_edge.video.hardware import HardwareEncoder
 from hvt_edge.video.rate_model import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.reconfigure import encoder_opener
+from hvt_edge.video.stage import Action, FrameDecision, FrameInputs, decide
 from hvt_edge.video.x265 import BaseEncoder, encoder_context
 from hvt_edge.wiring.video import encoder_plan
 from media.clips import START_NS, framed, hard_pictures, smooth_pictures
@@ -42,7 +45,6 @@ class Rig:
         self,
         *,
         frame_skip=None,
-        regions=None,
         recorder=None,
         interval_s=10.0,
         reconfigures=True,
@@ -60,7 +62,6 @@ class Rig:
             make_transmitter(self.kept, ledger=self.ledger, budget=budget, lockstep=True),
             keyframes=self.keyframes,
             local_copy=recorder,
-            regions=regions,
             frame_skip=self.frame_skip,
             reconfigure=self._reconfigure if reconfigures else None,
             open_again=self._open_again if reopens else None,
@@ -71,19 +72,8 @@ class Rig:
         self.reopened += 1
         return BaseEncoder(SETTINGS)
 
-    def play(self, pictures, *, asks=(), tracks=None) -> list[int]:
-        """Indices of the frames that were coded."""
-        coded = []
-        for frame in framed(pictures):
-            if frame.index in asks:
-                self.keyframes.request(frame.capture_ns)
-            decision = self.stage.decide(frame, now_ns=frame.capture_ns)
-            unit = self.stage.encode(frame, decision, now_ns=frame.capture_ns, tracks=tracks)
-            if unit is not None:
-                assert unit.frame_index == frame.index
-                self.stage.send(unit, decision, now_ns=frame.capture_ns)
-                coded.append(frame.index)
-        return coded
+    def play(self, pictures, *, asks=()) -> list[int]:
+        return stepped(self.stage, framed(pictures), asks=asks)
 
     def _reconfigure(self, decimation: int, now_ns: int) -> BaseEncoder | None:
         assert now_ns >= START_NS
@@ -93,19 +83,26 @@ class Rig:
         return BaseEncoder(replace(SETTINGS, fps=15.0 / decimation))
 
 
-def test_frames_that_are_not_coded_cost_nothing():
-    """``--fps auto`` would save no bit."""
-    rig = Rig(frame_skip=FrameSkip(3))
-    rig.opened.append(3)
-    assert rig.play(smooth_pictures(10, size=SIZE)) == [0, 3, 6, 9]
-    assert len(rig.kept.units) == 4
+def stepped(stage, frames, *, asks=()) -> list[int]:
+    """Indices of the frames that were coded; a ground requests a keyframe at ``asks``."""
+    coded = []
+    for frame in frames:
+        if frame.index in asks:
+            stage.keyframes.request(frame.capture_ns)
+        decision = stage.decide(frame, now_ns=frame.capture_ns)
+        if (unit := stage.encode(frame, decision, now_ns=frame.capture_ns)) is not None:
+            assert unit.frame_index == frame.index
+            stage.send(unit, decision, now_ns=frame.capture_ns)
+            coded.append(frame.index)
+    return coded
 
 
-def test_a_keyframe_on_demand_does_not_wait_for_its_turn():
-    """At three frames a second a ground that joins would look at nothing for longer than promised."""
+def test_frames_that_are_not_coded_cost_nothing_and_a_keyframe_waits_for_no_turn():
+    """``--fps auto`` would save no bit, or a ground that joins look at nothing for longer than promised."""
     rig = Rig(frame_skip=FrameSkip(8))
     rig.opened.append(8)
     assert rig.play(smooth_pictures(30, size=SIZE), asks=(10,)) == [0, 8, 10, 18, 26]
+    assert len(rig.kept.units) == 5
     assert BaseDecoder().decode(rig.kept.units[2]) is not None, "it is a keyframe"
 
 
@@ -158,22 +155,11 @@ BROKEN = np.zeros((4, 4), np.uint8)
 """A picture without colours: PyAV refuses it."""
 
 
-def stepped(rig: Rig, frames) -> list[int]:
-    """Indices of the frames that were coded."""
-    coded = []
-    for frame in frames:
-        decision = rig.stage.decide(frame, now_ns=frame.capture_ns)
-        if (unit := rig.stage.encode(frame, decision, now_ns=frame.capture_ns)) is not None:
-            rig.stage.send(unit, decision, now_ns=frame.capture_ns)
-            coded.append(frame.index)
-    return coded
-
-
 def test_an_encoder_that_fails_is_opened_again_on_a_keyframe():
     """One bad picture would end the flight, or leave grounds with frames that nothing they have explains."""
     rig, frames = Rig(), list(framed(smooth_pictures(12, size=SIZE)))
     frames[5] = replace(frames[5], base_bgr=BROKEN)
-    assert stepped(rig, frames) == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11]
+    assert stepped(rig.stage, frames) == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11]
     assert rig.reopened == 1
     decoder = BaseDecoder()
     assert decoder.decode(rig.kept.units[5]) is not None, "who joins there sees a picture"
@@ -190,10 +176,10 @@ def test_three_failures_in_ten_seconds_end_the_process_with_a_sentence():
     with pytest.raises(
         FlightError, match=r"x265 failed 3 times within 10 s .*: there is no video without it"
     ):
-        stepped(rig, frames)
+        stepped(rig.stage, frames)
     rig = Rig()
     slow = [replace(frame, capture_ns=START_NS + frame.index * 4 * SECOND_NS) for frame in frames]
-    assert stepped(rig, slow) == [0, 1, 2, 4, 6, 8, 9, 10, 11], "three in a minute do not"
+    assert stepped(rig.stage, slow) == [0, 1, 2, 4, 6, 8, 9, 10, 11], "three in a minute do not"
 
 
 def test_the_device_of_an_encoder_that_failed_is_free_before_each_try_to_open_another(monkeypatch):
@@ -220,7 +206,7 @@ def test_the_device_of_an_encoder_that_failed_is_free_before_each_try_to_open_an
     opened = encoder_opener(encoder_plan(config, SIZE), operating)
     rig = Rig()
     rig.stage.encoder, rig.stage.open_again = opened(rates), lambda: opened(rates)
-    assert stepped(rig, framed(smooth_pictures(3, size=SIZE))) == [1, 2]
+    assert stepped(rig.stage, framed(smooth_pictures(3, size=SIZE))) == [1, 2]
     assert busy == [0, 0, 0]
 
 
@@ -228,7 +214,9 @@ def test_in_lockstep_a_failing_encoder_is_an_error():
     """A study would compare a clip with holes in it."""
     rig = Rig(reopens=False)
     with pytest.raises(ValueError, match="ndim"):
-        stepped(rig, [replace(frame, base_bgr=BROKEN) for frame in framed(smooth_pictures(1, size=SIZE))])
+        stepped(
+            rig.stage, [replace(frame, base_bgr=BROKEN) for frame in framed(smooth_pictures(1, size=SIZE))]
+        )
 
 
 def test_no_encoder_at_all_is_one_sentence():
@@ -287,14 +275,7 @@ def test_the_least_budget_that_is_accepted_holds_in_every_second_to_the_byte(siz
         failures=failures,
     )
     pictures = hard_pictures(12 * fps, size=size)
-    for index, picture in enumerate(pictures):
-        frame = Frame(index, START_NS + index * SECOND_NS // fps, picture, picture)
-        if index % (4 * fps) == fps:
-            stage.keyframes.request(frame.capture_ns)
-        decision = stage.decide(frame, now_ns=frame.capture_ns)
-        unit = stage.encode(frame, decision, now_ns=frame.capture_ns)
-        if unit is not None:
-            stage.send(unit, decision, now_ns=frame.capture_ns)
+    stepped(stage, framed(pictures, fps=fps), asks=range(fps, 12 * fps, 4 * fps))
     assert ledger.worst_window_bps.total <= total_bps
     assert len(kept.units) > 0.9 * len(pictures), "and there is a picture"
 
@@ -305,24 +286,82 @@ class SizedEncoder:
     mean_qp = 30.0
 
     def encode(self, frame: Frame, *, keyframe: bool, regions: list[object]) -> AccessUnit:
-        """A keyframe is three frames large."""
         assert not regions
         return AccessUnit(frame.index, frame.capture_ns, bytes(20_000 if keyframe else 6_200), keyframe)
 
 
 def test_a_keyframe_that_a_ground_waits_for_has_the_room_of_the_frames_before_it():
     """Video that fills its budget would keep it waiting for 0.6 s, with frames that the ground cannot show."""
-    keyframes, keyframe_at, picture = Keyframes(KeyframeSettings(interval_ns=0)), [], np.zeros((2, 2, 3))
-    transmitter = make_transmitter(Puts(), budget=(800_000, 790_000), lockstep=True)
+    kept, keyframes = Puts(), Keyframes(KeyframeSettings(interval_ns=0))
+    transmitter = make_transmitter(kept, budget=(800_000, 790_000), lockstep=True)
     stage = make_base_stage(SizedEncoder(), transmitter, keyframes=keyframes, first_keyframe_bytes=20_500)
-    for index in range(60):
-        now_ns = START_NS + index * SECOND_NS // 15
-        if index == 30:
-            assert keyframes.request(now_ns) is None
-        frame = Frame(index, now_ns, picture, picture)
-        decision = stage.decide(frame, now_ns=now_ns)
-        unit = stage.encode(frame, decision, now_ns=now_ns)
-        if unit is not None and stage.send(unit, decision, now_ns=now_ns) and unit.keyframe:
-            keyframe_at.append(index)
-    assert keyframe_at[0] == 0
-    assert keyframe_at[1] <= 33
+    stepped(stage, framed([np.zeros((2, 2, 3), np.uint8)] * 60), asks=(30,))
+    first, second = (one.frame_index for one in kept.base if one.keyframe)
+    assert first == 0
+    assert second <= 33
+
+
+LIVE, OFFLINE, RETURNING = State.LIVE, State.OFFLINE, State.RETURNING
+SKIP, HOLD = FrameDecision(Action.SKIP), FrameDecision(Action.HOLD)
+TO_LINK = FrameDecision(Action.CODE, to_link=True)
+KEY_TO_LINK = FrameDecision(Action.CODE, keyframe=True, to_link=True, meets_plan=True)
+RESUME = FrameDecision(Action.CODE, keyframe=True, to_link=True, meets_plan=True, resumes=True)
+TO_STORE = FrameDecision(Action.CODE, to_store=True)
+KEY_TO_STORE = FrameDecision(Action.CODE, keyframe=True, to_store=True, meets_plan=True)
+SEGMENT = FrameDecision(Action.CODE, keyframe=True, to_store=True)
+PROBE = FrameDecision(Action.CODE, to_link=True, to_store=True)
+ANY = (False, True)
+NO, YES = (False,), (True,)
+
+# link, keyframe due, frame due, admitted, segment due, probe due: what is decided. ANY: it does not matter.
+TABLE = [
+    (LIVE, NO, NO, ANY, ANY, ANY, SKIP),
+    (LIVE, NO, YES, NO, ANY, ANY, HOLD),
+    (LIVE, NO, YES, YES, ANY, ANY, TO_LINK),
+    (LIVE, YES, ANY, NO, ANY, ANY, HOLD),
+    (LIVE, YES, ANY, YES, ANY, ANY, KEY_TO_LINK),
+    (OFFLINE, NO, NO, ANY, NO, ANY, SKIP),
+    (OFFLINE, NO, YES, ANY, NO, NO, TO_STORE),
+    (OFFLINE, NO, YES, NO, NO, YES, TO_STORE),
+    (OFFLINE, NO, YES, YES, NO, YES, PROBE),
+    (OFFLINE, YES, ANY, ANY, ANY, NO, KEY_TO_STORE),
+    (OFFLINE, NO, ANY, ANY, YES, NO, KEY_TO_STORE),
+    (OFFLINE, YES, ANY, NO, ANY, YES, KEY_TO_STORE),
+    (OFFLINE, NO, ANY, NO, YES, YES, KEY_TO_STORE),
+    (OFFLINE, YES, ANY, YES, ANY, YES, FrameDecision(Action.CODE, True, True, True, True)),
+    (OFFLINE, NO, ANY, YES, YES, YES, FrameDecision(Action.CODE, True, True, True, True)),
+    (RETURNING, YES, ANY, YES, ANY, ANY, RESUME),
+    (RETURNING, YES, NO, NO, NO, ANY, SKIP),
+    (RETURNING, YES, YES, NO, NO, ANY, TO_STORE),
+    (RETURNING, YES, ANY, NO, YES, ANY, SEGMENT),
+    (RETURNING, NO, NO, ANY, NO, ANY, SKIP),
+    (RETURNING, NO, YES, ANY, NO, ANY, TO_STORE),
+    (RETURNING, NO, ANY, ANY, YES, ANY, SEGMENT),
+]
+
+
+@pytest.mark.parametrize("row", TABLE, ids=[str(number) for number in range(len(TABLE))])
+def test_each_row_of_the_table(row):
+    """A frame would be missing between what was sent and what was stored, or a ground be shown what it cannot."""
+    link, keyframe_due, due, admitted, segment_due, probe_due, expected = row
+    for one in product(due, keyframe_due, admitted, segment_due, probe_due):
+        inputs = FrameInputs(*one[:3], link=link, segment_due=one[3], probe_due=one[4])
+        assert decide(inputs) == expected, inputs
+
+
+def test_the_table_leaves_no_case_out_and_decides_none_twice():
+    """One combination in flight that nobody thought of would be decided by accident."""
+    seen = [
+        (link, *one)
+        for link, keyframe_due, due, admitted, segment_due, probe_due, _ in TABLE
+        for one in product(keyframe_due, due, admitted, segment_due, probe_due)
+    ]
+    assert len(seen) == len(set(seen)) == 3 * 2**5
+
+
+def test_rates_change_at_keyframes_for_the_link_alone():
+    """What is stored would change its quality, or the stream on the link its parameters in mid-GOP."""
+    assert [one.reconfigures for one in (TO_LINK, KEY_TO_LINK, RESUME, TO_STORE, KEY_TO_STORE, SEGMENT)] == [
+        False, True, True, False, False, False,
+    ]  # fmt: skip
+    assert [one.codes for one in (SKIP, HOLD, TO_LINK, SEGMENT)] == [False, False, True, True]

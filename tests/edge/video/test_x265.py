@@ -10,13 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from av.filter import Graph
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
+from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video import x265
 from hvt_edge.video.encoder import PRESETS, EncoderSettings, keyframe_floor_bytes, minimum_bps
-from hvt_edge.video.x265 import MOST_REGIONS, BaseEncoder, Region
+from hvt_edge.video.x265 import MOST_REGIONS, BaseEncoder, Region, TrackRegions
 from media.clips import framed, hard_pictures, smooth_pictures
+from rigs.examples import tracks_of
 
 SIZE = (320, 192)
 VPS, SPS, PPS, IDR, FILLER = 32, 33, 34, (19, 20), 38
@@ -48,28 +52,36 @@ def encode(pictures, keyframes=(), regions=lambda _index: (), **changes):
     ]
 
 
+def decoded(units):
+    """Pictures; None for a unit that cannot be shown."""
+    decoder = BaseDecoder()
+    return [decoder.decode(unit.data) for unit in units]
+
+
+def errors_of(pictures, units):
+    """(height, width, 3) differences of the last pictures."""
+    return [
+        one.astype(np.float64) - picture
+        for one, picture in zip(decoded(units)[-6:], pictures[-6:], strict=True)
+    ]
+
+
 def errors_at(pictures, units, box):
     """Mean square error inside a box and outside it, over the last pictures."""
-    decoder = BaseDecoder()
-    decoded = [decoder.decode(unit.data) for unit in units]
     inside = np.zeros(pictures[0].shape[:2], bool)
     inside[box[1] : box[3], box[0] : box[2]] = True
-    squares = [
-        (one.astype(np.float64) - picture) ** 2
-        for one, picture in zip(decoded[-6:], pictures[-6:], strict=True)
-    ]
-    square = np.mean(squares, axis=(0, -1))
+    square = np.mean(np.square(errors_of(pictures, units)), axis=(0, -1))
     return float(square[inside].mean()), float(square[~inside].mean())
 
 
 def test_each_frame_gives_its_unit_at_once():
     """The operator would see the world one or more frames late."""
-    units = encode(smooth_pictures(20, size=SIZE))
-    assert [unit.frame_index for unit in units] == list(range(20))
-    assert all(nal_types(unit.data) for unit in units)
-    assert [unit.capture_ns for unit in units] == [
-        frame.capture_ns for frame in framed(smooth_pictures(20, size=SIZE))
+    frames = framed(pictures := smooth_pictures(20, size=SIZE))
+    units = encode(pictures)
+    assert [(one.frame_index, one.capture_ns) for one in units] == [
+        (one.index, one.capture_ns) for one in frames
     ]
+    assert all(nal_types(unit.data) for unit in units)
 
 
 @pytest.mark.parametrize("preset", ["ultrafast", "veryfast"])
@@ -79,9 +91,7 @@ def test_a_keyframe_comes_when_it_is_asked_for_and_only_then(preset):
     units = encode(hard_pictures(58, size=SIZE), keyframes=asked, preset=preset)
     assert [unit.frame_index for unit in units if unit.keyframe] == [0, *asked]
     assert [unit.frame_index for unit in units if is_idr(unit.data)] == [0, *asked]
-    for start in asked:
-        decoder = BaseDecoder()
-        assert all(decoder.decode(unit.data) is not None for unit in units[start : start + 3])
+    assert all(one is not None for start in asked for one in decoded(units[start : start + 3]))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it is about Linux's niceness")
@@ -115,10 +125,8 @@ def test_the_same_pictures_give_the_same_bytes():
 
 def test_what_comes_back_is_what_went_in():
     """Colours would be off for every viewer and every detector behind it."""
-    decoder = BaseDecoder()
     pictures = smooth_pictures(10, size=SIZE)
-    for picture, unit in zip(pictures, encode(pictures, bitrate_bps=600_000), strict=True):
-        error = decoder.decode(unit.data).astype(np.float64) - picture
+    *_, error = errors_of(pictures, encode(pictures, bitrate_bps=600_000))
     luma = error @ np.array([0.0722, 0.7152, 0.2126])
     assert abs(luma.mean()) < 0.3
     assert np.abs(error.mean(axis=(0, 1))).max() < 0.5
@@ -127,13 +135,12 @@ def test_what_comes_back_is_what_went_in():
 
 def test_more_bits_show_more():
     """The budget would be spent and nothing gained."""
-    pictures = hard_pictures(20, size=SIZE)
-    errors = []
-    for bitrate in (150_000, 600_000):
-        decoder = BaseDecoder()
-        decoded = [decoder.decode(unit.data) for unit in encode(pictures, bitrate_bps=bitrate)]
-        errors.append(float(((decoded[9].astype(np.float64) - pictures[9]) ** 2).mean()))
-    assert errors[1] < 0.8 * errors[0]
+    pictures = hard_pictures(10, size=SIZE)
+    few, many = (
+        np.square(errors_of(pictures, encode(pictures, bitrate_bps=bps))[-1]).mean()
+        for bps in (150_000, 600_000)
+    )
+    assert many < 0.8 * few
 
 
 def test_the_given_arrays_are_left_alone():
@@ -148,10 +155,9 @@ def test_the_given_arrays_are_left_alone():
 @pytest.mark.parametrize("fps", [0.5, 29.97])
 def test_sizes_and_rates_at_the_rim_work(size, fps):
     """An odd camera could not be used."""
-    encoder = BaseEncoder(settings(size=size, fps=fps, bitrate_bps=500_000, preset="ultrafast"))
-    decoder = BaseDecoder()
-    for frame in framed(smooth_pictures(3, size=size)):
-        assert decoder.decode(encoder.encode(frame).data).shape == (size[1], size[0], 3)
+    rim = {"size": size, "fps": fps, "bitrate_bps": 500_000, "preset": "ultrafast"}
+    shown = decoded(encode(smooth_pictures(3, size=size), **rim))
+    assert [one.shape for one in shown] == [(size[1], size[0], 3)] * 3
 
 
 def test_what_x265_refuses_is_one_sentence():
@@ -162,9 +168,8 @@ def test_what_x265_refuses_is_one_sentence():
 
 def test_every_preset_opens():
     """A preset that ``--help`` names would end the edge at its start."""
-    picture = framed(smooth_pictures(1, size=(64, 64)))[0]
     for preset in PRESETS:
-        assert BaseEncoder(settings(size=(64, 64), preset=preset)).encode(picture).keyframe
+        assert encode(smooth_pictures(1, size=(64, 64)), size=(64, 64), preset=preset)[0].keyframe
 
 
 @pytest.mark.parametrize(
@@ -213,28 +218,20 @@ def test_regions_that_come_late_and_go_again_are_safe():
     plain = encode(pictures, keyframes=(15,))
     assert [unit.data for unit in units[:10]] == [unit.data for unit in plain[:10]]
     assert units[10].data != plain[10].data
-    decoder = BaseDecoder()
-    assert all(decoder.decode(unit.data) is not None for unit in units)
+    assert all(one is not None for one in decoded(units))
 
 
 @pytest.mark.parametrize(
-    "region",
+    ("box", "offset"),
     [
-        Region((-50, -50, 10, 10), -0.2),
-        Region((300, 180, 5000, 5000), -0.2),
-        Region((40, 40, 40, 90), -0.2),
-        Region((90, 90, 40, 40), -0.2),
-        Region((900, 900, 950, 950), -0.2),
-        Region(BOX, -7.0),
-        Region(BOX, float("nan")),
+        *(((-50, -50, 10, 10), -0.2), ((300, 180, 5000, 5000), -0.2), ((40, 40, 40, 90), -0.2)),
+        *(((90, 90, 40, 40), -0.2), ((900, 900, 950, 950), -0.2), (BOX, -7.0), (BOX, float("nan"))),
     ],
 )
-def test_a_region_at_or_beyond_the_rim_is_cut(region):
+def test_a_region_at_or_beyond_the_rim_is_cut(box, offset):
     """A track that leaves the picture would end the edge."""
-    pictures = hard_pictures(6, size=SIZE)
-    units = encode(pictures, regions=lambda index: [region] * (index % 2))
-    decoder = BaseDecoder()
-    assert all(decoder.decode(unit.data) is not None for unit in units)
+    units = encode(hard_pictures(6, size=SIZE), regions=lambda index: [Region(box, offset)] * (index % 2))
+    assert all(one is not None for one in decoded(units))
 
 
 def test_more_regions_than_are_taken_are_left_out():
@@ -242,9 +239,11 @@ def test_more_regions_than_are_taken_are_left_out():
     pictures = hard_pictures(4, size=SIZE)
     wanted = [Region((x, y, x + 8, y + 8), -0.1) for x in range(0, 320, 8) for y in range(0, 192, 8)]
     assert len(wanted) > MOST_REGIONS
-    units = encode(pictures, regions=lambda _: wanted)
-    few = encode(pictures, regions=lambda _: wanted[:MOST_REGIONS])
-    assert [unit.data for unit in units] == [unit.data for unit in few]
+    all_of_them, few = (
+        [one.data for one in encode(pictures, regions=lambda _, some=some: some)]
+        for some in (wanted, wanted[:MOST_REGIONS])
+    )
+    assert all_of_them == few
 
 
 def test_regions_that_stay_are_not_set_up_again(monkeypatch):
@@ -272,25 +271,25 @@ def test_the_quantiser_is_told():
 def test_a_new_encoder_goes_on_in_the_same_stream():
     """A change of frame rate would stop the ground's decoder, or mix two pictures."""
     pictures = hard_pictures(20, size=SIZE)
-    frames = framed(pictures)
-    decoder = BaseDecoder()
-    for encoder, part in (
-        (BaseEncoder(settings(bitrate_bps=800_000)), frames[:10]),
-        (BaseEncoder(settings(bitrate_bps=800_000, fps=5.0)), frames[10::3]),
-    ):
-        for frame in part:
-            decoded = decoder.decode(encoder.encode(frame, keyframe=frame is part[0]).data)
-            error = (decoded.astype(np.float64) - frame.base_bgr).mean()
-            assert decoded.shape == (SIZE[1], SIZE[0], 3)
-            assert abs(error) < 3
+    parts = (pictures[:10], 15.0), (pictures[10::3], 5.0)
+    units = [
+        unit for part, fps in parts for unit in encode(part, bitrate_bps=800_000, fps=fps, keyframes=(0,))
+    ]
+    for one, picture in zip(decoded(units), [*pictures[:10], *pictures[10::3]], strict=True):
+        assert abs((one.astype(np.float64) - picture).mean()) < 3
+
+
+def still_scene(count: int, *, noise: float) -> list[np.ndarray]:
+    """What a camera that does not move gives."""
+    chance, scene = np.random.default_rng(5), hard_pictures(1, size=SIZE)[0].astype(np.float64)
+    grain = (chance.normal(0, noise, scene.shape) for _ in range(count))
+    return [np.clip(scene + one, 0, 255).astype(np.uint8) for one in grain]
 
 
 @pytest.mark.parametrize("preset", ["superfast", "veryfast"])
 def test_a_still_camera_uses_its_rate_after_a_keyframe(preset):
     """x265 left half of it unused for five seconds, while the picture was as coarse as the keyframe."""
-    chance, scene = np.random.default_rng(5), hard_pictures(1, size=SIZE)[0].astype(np.float64)
-    pictures = [np.clip(scene + chance.normal(0, 6, scene.shape), 0, 255).astype(np.uint8) for _ in range(75)]
-    units = encode(pictures, keyframes=(30,), preset=preset)
+    units = encode(still_scene(75, noise=6), keyframes=(30,), preset=preset)
     bits = [8 * len(unit.data) for unit in units]
     assert sum(bits[31:]) * 15 / 44 >= 0.75 * 200_000
     assert max(sum(bits[start : start + 15]) for start in range(61)) <= 1.1 * 200_000
@@ -300,9 +299,58 @@ def test_a_still_camera_uses_its_rate_after_a_keyframe(preset):
 @pytest.mark.parametrize(("fps", "bitrate_bps"), [(5.0, 80_000), (15.0, 200_000)])
 def test_a_keyframe_is_as_good_whatever_came_before(fps, bitrate_bps):
     """That of a still scene came at QP 51, a tenth of its bits used: x265 held the frames before against it."""
-    chance, scene = np.random.default_rng(5), hard_pictures(1, size=SIZE)[0].astype(np.float64)
-    pictures = [np.clip(scene + chance.normal(0, 2, scene.shape), 0, 255).astype(np.uint8) for _ in range(40)]
-    encoder = BaseEncoder(settings(fps=fps, bitrate_bps=bitrate_bps, vbv_s=max(0.15, 1.3 / fps)))
-    units = [encoder.encode(frame, keyframe=frame.index == 30) for frame in framed(pictures, fps=fps)]
+    given = {"fps": fps, "bitrate_bps": bitrate_bps, "vbv_s": max(0.15, 1.3 / fps)}
+    units = encode(still_scene(40, noise=2), keyframes=(30,), **given)
     assert len(units[30].data) > 0.8 * len(units[0].data)
     assert is_idr(units[30].data)
+
+
+WIDE = (640, 360)
+
+
+def tracks(*boxes, confidences=None) -> Tracks:
+    """Tracks at these boxes."""
+    return tracks_of(0, boxes, confidences=0.5 if confidences is None else confidences)
+
+
+def test_tracks_are_quantised_finer_with_a_margin():
+    """R0 would be M0 under another name, or the outline of a car stay in the poor part."""
+    plan = TrackRegions(WIDE, depth=0.1, padding=0.0)
+    assert plan.regions(tracks((33, 20, 60, 40))) == [Region((32, 16, 64, 48), -0.1)]
+    assert plan.regions(None) == plan.regions(tracks()) == []
+    plan = TrackRegions(WIDE, depth=0.1, padding=0.5)
+    assert plan.regions(tracks((600, 340, 639, 359)))[0].box_px == (576, 320, 640, 360)
+
+
+def test_tracks_that_fill_the_picture_are_quantised_less_fine():
+    """Everything would be important: x265 would take the bits from the very same tracks, and lose quality."""
+    plan = TrackRegions(WIDE, depth=0.1, padding=0.0, free_share=0.1)
+    (one,) = plan.regions(tracks((0, 0, 320, 352)))
+    assert -0.03 < one.offset < -0.015
+    two = plan.regions(tracks((0, 0, 320, 352), (0, 0, 320, 352)))
+    assert [region.offset for region in two] == [one.offset] * 2, "what overlaps covers once"
+
+
+def test_the_surest_tracks_stay_where_there_are_too_many():
+    """The cars would lose their place to what is hardly one."""
+    boxes = [
+        (16 * (index % 40), 16 * (index // 40), 16 * (index % 40) + 8, 16 * (index // 40) + 8)
+        for index in range(200)
+    ]
+    plan = TrackRegions(WIDE, depth=0.1, padding=0.0)
+    regions = plan.regions(tracks(*boxes, confidences=[0.2] * 100 + [0.9] * 100))
+    assert len(regions) == MOST_REGIONS
+    assert min(region.box_px[1] for region in regions) >= 32
+
+
+@given(
+    boxes=st.lists(st.tuples(*[st.floats(-2000, 4000, width=32) | st.just(float("nan"))] * 4), max_size=30)
+)
+def test_no_box_of_a_tracker_breaks_a_plan(boxes):
+    """A track that leaves the picture, or whose filter ran away, would end the edge."""
+    held = tracks(*boxes)
+    for region in TrackRegions(WIDE, depth=0.1).regions(held):
+        x1, y1, x2, y2 = region.box_px
+        assert 0 <= x1 < x2 <= 640
+        assert 0 <= y1 < y2 <= 360
+        assert -0.1 <= region.offset < 0

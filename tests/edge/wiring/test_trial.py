@@ -18,27 +18,28 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.opening import open_source
 from hvt_edge.wiring import Beginning, make_detector, trial, try_scene
 
+LOCKSTEP = ("--pace", "lockstep", "--size", "640x360", "--preset", "ultrafast")
+THIN = (*LOCKSTEP, "--budget", "100kbps")
 
-def settings(source: str, budget: str, *flags: str) -> EdgeConfig:
-    words = ["--source", source, "--pace", "lockstep", "--budget", budget, "--size", "640x360"]
-    words += ["--preset", "ultrafast", *flags]
-    loaded, given = load(EdgeConfig, words, program="hvt-edge", description="")
+
+def settings(source: str, *flags: str) -> EdgeConfig:
+    loaded, given = load(EdgeConfig, ["--source", source, *flags], program="hvt-edge", description="")
     return check(with_profile(loaded, given=given.values))
 
 
-def tried(config: EdgeConfig, source: Source) -> Beginning:
+def tried(config: EdgeConfig, source: Source, *, clock=lambda: 0) -> Beginning:
     detector = make_detector(config)
-    return try_scene(config, source, detector=detector, clock=lambda: 0, stop=threading.Event())
+    return try_scene(config, source, detector=detector, clock=clock, stop=threading.Event())
 
 
-def moving(folder: Path, *, coarse: int, frames: int) -> Path:
+def moving(folder: Path, *, coarse: int = 60, frames: int = 15) -> str:
     """A landscape that moves by three pixels a frame; the coarser its grain, the easier it is to code."""
     rng = np.random.default_rng(1)
     grain = rng.integers(0, 255, (420 // coarse, 720 // coarse, 3), np.uint8)
     ground = cv2.resize(grain, (720, 420), interpolation=cv2.INTER_CUBIC)
     for index in range(frames):
         cv2.imwrite(str(folder / f"{index:03}.png"), ground[30:390, 3 * index : 3 * index + 640])
-    return folder
+    return str(folder)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +54,7 @@ def moving(folder: Path, *, coarse: int, frames: int) -> Path:
 )
 def test_auto_begins_with_the_frame_rate_that_the_scene_needs(tmp_path, coarse, frames, flags, decimation):
     """An easy scene would be shown at half its rate, and a hard one in mud."""
-    config = settings(str(moving(tmp_path, coarse=coarse, frames=frames)), "100kbps", *flags)
+    config = settings(moving(tmp_path, coarse=coarse, frames=frames), *THIN, *flags)
     with open_source(str(tmp_path), size=(640, 360), fps=15) as source:
         beginning = tried(config, source)
         assert beginning.decimation == decimation
@@ -68,7 +69,7 @@ def test_auto_begins_with_what_the_base_hides():
     seen = {}
     with open_source("demo", size=(640, 360), fps=15) as source:
         for budget in ("100kbps", "8000kbps"):
-            config = settings("demo", budget)
+            config = settings("demo", *LOCKSTEP, "--budget", budget)
             beginning = tried(config, source)
             seen[budget] = beginning.shadow
             assert 1.5 < beginning.shadow.comparisons < 3
@@ -84,8 +85,7 @@ def test_a_scene_without_objects_keeps_the_bits_for_video(tmp_path, monkeypatch,
     Nothing flies yet, so what a comparison takes of a processor is no reason to leave one out: one tells too little.
     """
     monkeypatch.setattr(time, "thread_time_ns", count(step=SECOND_NS // 5).__next__)
-    flags = ("--pace", pace, "--provider", "cpu")
-    config = settings(str(moving(tmp_path, coarse=60, frames=15)), "100kbps", *flags)
+    config = settings(moving(tmp_path), *THIN, "--pace", pace, "--provider", "cpu")
     with open_source(str(tmp_path), size=(640, 360), fps=15) as source:
         beginning = tried(config, source)
     assert beginning.shadow.comparisons > 1.5
@@ -95,9 +95,8 @@ def test_a_scene_without_objects_keeps_the_bits_for_video(tmp_path, monkeypatch,
 
 def test_no_second_of_a_live_source_is_lost_for_nothing(tmp_path):
     """With `motion` nothing is compared, and a fixed frame rate is not tried either."""
-    pictures = str(moving(tmp_path, coarse=60, frames=3))
-    config = settings(pictures, "100kbps", "--detector", "motion", "--fps", "15")
-    with open_source(pictures, size=(640, 360), fps=15) as source:
+    config = settings(moving(tmp_path, frames=3), *THIN, "--detector", "motion", "--fps", "15")
+    with open_source(str(tmp_path), size=(640, 360), fps=15) as source:
         source.steps = lambda **_kind: pytest.fail("a frame was taken")
         assert tried(config, source).decimation == 1
 
@@ -105,23 +104,20 @@ def test_no_second_of_a_live_source_is_lost_for_nothing(tmp_path):
 @pytest.mark.parametrize("flags", [("--profile", "thin"), ("--detector", "motion")])
 def test_nothing_is_measured_where_nothing_depends_on_it(tmp_path, flags):
     """Nor by a detector that remembers the pictures of one stream: there the settings decide alone."""
-    pictures = str(moving(tmp_path, coarse=60, frames=15))
-    with open_source(pictures, size=(640, 360), fps=15) as source:
-        assert tried(settings(pictures, "100kbps", *flags), source).shadow.comparisons == 0
+    config = settings(moving(tmp_path), *THIN, *flags)
+    with open_source(str(tmp_path), size=(640, 360), fps=15) as source:
+        assert tried(config, source).shadow.comparisons == 0
 
 
 @pytest.mark.parametrize(("most_cores", "preset"), [(1e9, "veryfast"), (1e-9, "ultrafast")])
-@pytest.mark.parametrize("flags", [("--method", "M0"), ("--detector", "motion")])
+@pytest.mark.parametrize("flags", [("--method", "M0"), ()])
 def test_auto_begins_with_the_preset_that_there_is_time_for(
     tmp_path, monkeypatch, caplog, flags, most_cores, preset
 ):
     """The first second of a flight would lose its frames, and a keyframe would be spent on finding out."""
     monkeypatch.setattr(trial, "share_of", lambda _cores: most_cores)
-    words = ["--source", str(moving(tmp_path, coarse=60, frames=5)), "--size", "320x192", *flags]
-    loaded, given = load(EdgeConfig, words, program="hvt-edge", description="")
-    config = check(with_profile(loaded, given=given.values))
-    detector = make_detector(check(EdgeConfig(source="demo", detector="motion")))
+    config = settings(moving(tmp_path, frames=5), "--size", "320x192", "--detector", "motion", *flags)
     with caplog.at_level("INFO"), open_source(str(tmp_path), size=(320, 192), fps=15) as source:
-        beginning = try_scene(config, source, detector=detector, clock=time.time_ns, stop=threading.Event())
+        beginning = tried(config, source, clock=time.time_ns)
     assert beginning.preset.preset == preset
     assert caplog.messages == ([beginning.preset.says] if preset == "ultrafast" else [])

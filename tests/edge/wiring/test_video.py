@@ -38,38 +38,31 @@ def test_no_source_is_enlarged(source, letterbox, crop):
     assert default_size(source, fit="crop") == crop
 
 
-def settled(*flags: str) -> EdgeConfig:
+def settled(flags: str = "") -> EdgeConfig:
     """The settings as a start takes them."""
-    config, loaded = load(EdgeConfig, ["--source", "x.mp4", *flags], program="hvt-edge", description="")
+    words = ["--source", "x.mp4", *flags.split()]
+    config, loaded = load(EdgeConfig, words, program="hvt-edge", description="")
     return check(with_profile(config, given=loaded.values))
 
 
 @pytest.mark.parametrize(
-    ("flags", "size"),
-    [((), (360, 240)), (("--size", "1280x720"), (1280, 720)), (("--fit", "crop"), (360, 202))],
-)
-def test_a_size_that_is_given_holds(flags, size):
-    """Who wants a small camera enlarged, as the ground's detector may, must be able to say so."""
-    found = base_size(settled(*flags))
-    assert (found((360, 240)) if callable(found) else found) == size
-
-
-@pytest.mark.parametrize(
-    ("flags", "size"),
+    ("flags", "source", "size"),
     [
-        ("--method M0 --fps 2 --budget 40kbps", (1280, 720)),
-        ("--method M0 --fps 2 --budget 30kbps", (960, 540)),
-        ("--method M0 --fps 2 --budget 13kbps", (320, 180)),
-        ("--method M0 --fps 2 --budget 12kbps", (320, 180)),  # and is refused
-        ("--profile M0-best --budget 31kbps", (320, 180)),
+        ("", (360, 240), (360, 240)),
+        ("--size 1280x720", (360, 240), (1280, 720)),
+        ("--fit crop", (360, 240), (360, 202)),
+        ("--method M0 --fps 2 --budget 40kbps", (1920, 1080), (1280, 720)),
+        ("--method M0 --fps 2 --budget 30kbps", (1920, 1080), (960, 540)),
+        ("--method M0 --fps 2 --budget 13kbps", (1920, 1080), (320, 180)),
+        ("--method M0 --fps 2 --budget 12kbps", (1920, 1080), (320, 180)),  # and is refused
+        ("--profile M0-best --budget 31kbps", (1920, 1080), (320, 180)),
     ],
 )
-def test_a_thin_budget_makes_the_picture_smaller_where_nobody_says_how_large_it_is(flags, size):
-    """The start would be refused for a size that nobody has asked for."""
-    config = settled(*flags.split())
+def test_a_size_that_is_given_holds_and_another_fits_the_budget(flags, source, size):
+    """The start would be refused for a size that nobody has asked for, or a given one count for nothing."""
+    config = settled(flags)
     found = base_size(config)
-    assert callable(found)
-    assert found((1920, 1080)) == size
+    assert (found(source) if callable(found) else found) == size
     if config.budget_bps > 12_000:
         check_rate(config, size)
 
@@ -91,9 +84,8 @@ def test_no_refusal_says_the_cameras_password(tmp_path: Path, coded, says):
 # What stills are worth, by how much finer the source is than the base.
 
 
-def settings(*flags: str) -> EdgeConfig:
-    loaded, given = load(EdgeConfig, ["--source", "x.mp4", *flags], program="hvt-edge", description="")
-    return check(with_profile(loaded, given=given.values))
+def view_of(source: tuple[int, int]) -> View:
+    return View.fitted(source, (1280, 720), fit="letterbox")
 
 
 @pytest.mark.parametrize(
@@ -108,8 +100,7 @@ def settings(*flags: str) -> EdgeConfig:
 )
 def test_auto_values_pixels_that_the_base_does_not_have(source, weight, finer):
     """Of a 4K camera the operator would get a 720p picture, and no still that shows more."""
-    view = View.fitted(source, (1280, 720), fit="letterbox")
-    config = settings()
+    view, config = view_of(source), settled()
     made = make_method(config, view)
     assert isinstance(made, ExpectedGain)
     assert made.detail_weight == pytest.approx(weight)
@@ -118,29 +109,23 @@ def test_auto_values_pixels_that_the_base_does_not_have(source, weight, finer):
 
 def test_a_method_that_comes_back_has_the_parameters_it_began_with():
     """`set-method M5` and back would fly another M6 than was asked for."""
-    view = View.fitted((1280, 720), (1280, 720), fit="letterbox")
-    config = settings("--tune", "min_gain=0.07")
+    view, config = view_of((1280, 720)), settled("--tune min_gain=0.07")
     assert make_method(config, view) == make_method(config, view, name="m6")
     assert make_method(config, view, name="M5").name == "M5"
-
-
-@pytest.mark.parametrize("flags", [("--tune", "detail_weight=0"), ("--method", "M5", "--profile", "auto")])
-def test_stills_may_pause_where_nobody_wants_details(flags):
-    """They would be sent for ever, for what the method does not value."""
-    view = View.fitted((3840, 2160), (1280, 720), fit="letterbox")
-    assert not auto_settings(settings(*flags), view).finer
 
 
 @pytest.mark.parametrize(
     ("flags", "weight"),
     [
-        (("--tune", "detail_weight=2"), 2),
-        (("--method", "M6"), 0),
-        (("--profile", "thin"), 0),
-        (("--profile", "auto", "--method", "M5"), None),
+        ("--tune detail_weight=2", 2),
+        ("--tune detail_weight=0", 0),
+        ("--method M6", 0),
+        ("--profile thin", 0),
+        ("--profile auto --method M5", None),
     ],
 )
-def test_what_was_asked_for_holds(flags, weight):
-    """A study of M6 would fly another method, or a user's word count for nothing."""
-    made = make_method(settings(*flags), View.fitted((3840, 2160), (1280, 720), fit="letterbox"))
-    assert getattr(made, "detail_weight", None) == weight
+def test_what_was_asked_for_holds_and_stills_may_pause_where_nobody_wants_details(flags, weight):
+    """A study of M6 would fly another method, or stills be sent for ever for what the method does not value."""
+    config, view = settled(flags), view_of((3840, 2160))
+    assert getattr(make_method(config, view), "detail_weight", None) == weight
+    assert auto_settings(config, view).finer == bool(weight)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -58,15 +58,21 @@ def write_numbered(
     pictures: Iterable[np.ndarray] | None = None,
     rate: int | Fraction = 30,
     codec: str = "libx264",
+    pixels: str = "yuv420p",
     times_ms: Iterable[int] | None = None,
+    places: Sequence[int] | None = None,
+    muxer: dict[str, str] | None = None,
     setup: Callable[[Any], None] = lambda _: None,
     **options: str,
 ) -> Path:
-    """A clip; ``times_ms`` are the frames' own times, ``setup`` gets the stream before the first."""
+    """A clip of BGR or 16-bit grey; ``setup`` gets the stream before its frames.
+
+    Their times are ``times_ms``, or their ``places`` at ``rate``.
+    """
     times = None if times_ms is None else list(times_ms)
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=muxer or {}) as container:
         stream: Any = container.add_stream(codec, rate=rate)
-        stream.pix_fmt = "yuv420p"
+        stream.pix_fmt = pixels
         stream.options = {"x265-params": "log-level=none", **options} if codec == "libx265" else options
         if times is not None:
             stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
@@ -74,9 +80,27 @@ def write_numbered(
         for place, picture in enumerate(pictures or (numbered(one) for one in range(count))):
             if not place:
                 stream.height, stream.width = picture.shape[:2]
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24").reformat(format="yuv420p")
+            given = "bgr24" if picture.ndim == 3 else "gray16le"
+            frame = av.VideoFrame.from_ndarray(picture, format=given).reformat(format=pixels)
             if times is not None:
                 frame.pts, frame.time_base = times[place], Fraction(1, 1000)
+            elif places is not None:
+                frame.pts, frame.time_base = places[place], 1 / Fraction(rate)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
+    return path
+
+
+def copied(parts: Iterable[tuple[Path, Callable[[Any], int]]], path: Path) -> Path:
+    """The films of ``parts`` in one file, not coded anew, each packet later by what its part's function gives."""
+    with av.open(str(path), "w") as out:
+        stream: Any = None
+        for part, later in parts:
+            with av.open(str(part)) as container:
+                stream = stream or out.add_stream_from_template(container.streams.video[0])
+                for packet in container.demux(video=0):
+                    if packet.size:
+                        by = later(packet)
+                        packet.pts, packet.dts, packet.stream = packet.pts + by, packet.dts + by, stream
+                        out.mux(packet)
     return path

@@ -90,7 +90,6 @@ class Timeline:
         self._at_s: Fraction | None = None
         self._offset_s = Fraction(0)
         self._former_s: Fraction | None = None
-        """The offset before the last jump."""
         self.jumps: list[tuple[Fraction, Fraction]] = []
         """Place of each repair in the presentation, and the size of the step; seconds."""
 

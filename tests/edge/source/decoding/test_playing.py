@@ -18,7 +18,7 @@ from PIL import Image
 from hvt_common.errors import UserError
 from hvt_edge.source.decoding import container
 from hvt_edge.source.opening import open_source
-from media.numbered import disc, number_of, numbered, patch, write_numbered
+from media.numbered import copied, disc, number_of, numbered, patch, write_numbered
 
 
 def play(spec, *, fps=30.0, **settings):
@@ -28,26 +28,45 @@ def play(spec, *, fps=30.0, **settings):
 
 
 def numbers(pictures):
-    """Of `numbered` ones."""
     return [number_of(one) for one in pictures]
 
 
 # -- time -------------------------------------------------------------------
 
 
-def test_avi_with_b_frames_plays_every_frame_once(tmp_path):
-    """AVI says no time of presentation: half of the frames would be left out, and the rest judder."""
-    clip = write_numbered(tmp_path / "a.avi", 60, bf="3", **{"x264-params": "b-adapt=0"})
-    source, pictures = play(clip)
-    assert numbers(pictures) == list(range(60))
-    assert "AVI has time stamps of the decoding alone" in " ".join(source.notes)
-
-
-def test_times_in_whole_milliseconds_lose_no_frame_in_a_finer_unit(tmp_path):
-    """Each third frame of a Matroska recording that was put into an MP4 as it is was lost, and others shown twice."""
-    times = [round(one * 1000 / 30) for one in range(60)]
-    clip = write_numbered(tmp_path / "a.mp4", 60, times_ms=times, bf="0")
-    assert numbers(play(clip)[1]) == list(range(60))
+@pytest.mark.parametrize(
+    ("name", "made", "fps", "shown", "says"),
+    [
+        # AVI says no time of presentation: half of the frames would be left out, and the rest judder.
+        (
+            "a.avi",
+            {"bf": "3", "x264-params": "b-adapt=0"},
+            30,
+            range(60),
+            "time stamps of the decoding alone",
+        ),
+        # Each third frame of a Matroska recording that was put into an MP4 as it is was lost, others shown twice.
+        ("a.mp4", {"times_ms": [round(one * 1000 / 30) for one in range(60)], "bf": "0"}, 30, range(60), ""),
+        # FFmpeg takes 25 frames a second for any.
+        ("a.h264", {}, 30, range(60), "30 frames a second, as the stream itself says"),
+        ("a.hevc", {"codec": "libx265"}, 30, range(60), "30 frames a second, as the stream itself says"),
+        # Encoders that were told no rate write their clock (picamera#541): the log called it the stream's own 25.
+        ("a.h264", {"rate": 500}, 25, range(60), "25 frames a second, which is a guess"),
+        # Of a film whose header has its clock in place of its rate, two pictures were shown, without a word.
+        (
+            "a.mkv",
+            {"times_ms": range(60), "bf": "0"},
+            30,
+            (1, 34),
+            "1000 frames a second, of which most are left out; --source-fps N",
+        ),
+    ],
+)
+def test_a_film_runs_at_its_own_rate_and_guesses_are_said(tmp_path, name, made, fps, shown, says):
+    """It would be slow, judder, or lose frames, and nobody be told why."""
+    source, pictures = play(write_numbered(tmp_path / name, 60, **made), fps=fps)
+    assert numbers(pictures) == list(shown)
+    assert says in " ".join(source.notes)
 
 
 @pytest.mark.parametrize("late", [1, 30, 59])
@@ -72,37 +91,9 @@ def test_a_pause_is_a_pause_but_where_containers_jump(tmp_path, caplog, name):
 def test_what_an_edit_list_hides_is_not_missing(tmp_path, caplog, group):
     """A clip that was trimmed without being coded anew would be called unfinished."""
     whole = write_numbered(tmp_path / "whole.mp4", 60, bf="0", g=str(group))
-    with av.open(str(whole)) as source, av.open(str(tmp_path / "a.mp4"), "w") as trimmed:
-        stream = trimmed.add_stream_from_template(source.streams.video[0])
-        for packet in source.demux(video=0):
-            if packet.size:
-                packet.pts -= 15 * packet.duration
-                packet.dts -= 15 * packet.duration
-                packet.stream = stream
-                trimmed.mux(packet)
-    assert numbers(play(tmp_path / "a.mp4")[1]) == list(range(15, 60))
+    clip = copied([(whole, lambda packet: -15 * packet.duration)], tmp_path / "a.mp4")
+    assert numbers(play(clip)[1]) == list(range(15, 60))
     assert "unfinished" not in caplog.text
-
-
-@pytest.mark.parametrize(("name", "codec"), [("a.h264", "libx264"), ("a.hevc", "libx265")])
-def test_a_raw_stream_runs_at_its_own_rate(tmp_path, name, codec):
-    """Its film would be slow: FFmpeg takes 25 frames a second for any."""
-    source, pictures = play(write_numbered(tmp_path / name, 60, codec=codec))
-    assert numbers(pictures) == list(range(60))
-    assert "30 frames a second, as the stream itself says" in " ".join(source.notes)
-
-
-def test_a_raw_stream_that_says_an_impossible_rate_is_guessed_at(tmp_path):
-    """Encoders that were told no rate write their clock (picamera#541): the log called it the stream's own 25."""
-    source, _ = play(write_numbered(tmp_path / "a.h264", 9, rate=500))
-    assert "25 frames a second, which is a guess" in " ".join(source.notes)
-
-
-def test_a_rate_beyond_all_cameras_is_said(tmp_path):
-    """Of a film whose header has its clock in place of its rate, two pictures were shown, without a word."""
-    source, pictures = play(write_numbered(tmp_path / "a.mkv", 60, times_ms=list(range(60)), bf="0"))
-    assert len(pictures) == 2
-    assert "1000 frames a second, of which most are left out; --source-fps N" in " ".join(source.notes)
 
 
 def test_the_rate_of_jpegs_in_a_row_is_a_guess(tmp_path):
@@ -131,34 +122,33 @@ def test_pictures_that_a_decoder_patched_are_counted(tmp_path, caplog):
 @pytest.mark.parametrize("attached", [False, True])
 def test_a_cover_picture_is_no_film(tmp_path, attached):
     """A grey picture would be flown in place of the film."""
-    clip = tmp_path / "a.mp4"
-    with av.open(str(clip), "w") as container:
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
         cover, film = container.add_stream("mjpeg", rate=30), container.add_stream("libx264", rate=30)
         cover.width, cover.height, cover.pix_fmt = 640, 480, "yuvj420p"
         film.width, film.height, film.pix_fmt = 320, 240, "yuv420p"
         if attached:
             cover.disposition = Disposition.attached_pic
-        grey = av.VideoFrame.from_ndarray(np.full((480, 640, 3), 60, np.uint8), format="bgr24")
-        container.mux(cover.encode(grey.reformat(format="yuvj420p")))
-        container.mux(cover.encode(None))
-        for one in range(30):
-            container.mux(film.encode(av.VideoFrame.from_ndarray(numbered(one), format="bgr24")))
-        container.mux(film.encode(None))
-    source, pictures = play(clip)
+        for stream, pictures in (
+            (cover, [np.full((480, 640, 3), 60, np.uint8)]),
+            (film, map(numbered, range(30))),
+        ):
+            for picture in pictures:
+                frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+                container.mux(stream.encode(frame.reformat(format=stream.pix_fmt)))
+            container.mux(stream.encode(None))
+    source, pictures = play(tmp_path / "a.mp4")
     assert numbers(pictures) == list(range(30))
     assert "is the film (h264, 320x240)" in source.notes[0]
 
 
 def test_a_cover_picture_alone_is_called_so(tmp_path):
     """A song would fly as a film of one picture."""
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        cover = container.add_stream("mjpeg", rate=30)
-        cover.width, cover.height, cover.pix_fmt = 320, 240, "yuvj420p"
-        cover.disposition = Disposition.attached_pic
-        frame = av.VideoFrame.from_ndarray(numbered(3), format="bgr24")
-        container.mux(cover.encode(frame.reformat(format="yuvj420p")))
-        container.mux(cover.encode(None))
-    source, pictures = play(tmp_path / "a.mp4")
+
+    def setup(stream):
+        stream.disposition = Disposition.attached_pic
+
+    made = {"codec": "mjpeg", "pixels": "yuvj420p", "setup": setup, "pictures": [numbered(3)]}
+    source, pictures = play(write_numbered(tmp_path / "a.mp4", **made))
     assert numbers(pictures[:1]) == [3]
     assert "it holds no film: what is shown is its cover picture" in source.notes
 
@@ -263,15 +253,7 @@ def test_interlaced_film_has_no_combs(tmp_path):
 
 def grey16(path, pictures, *, pixels="gray16le"):
     """A lossless film of sixteen bits, or of the upper ones."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=30)
-        stream.height, stream.width = pictures[0].shape
-        stream.pix_fmt = pixels
-        for picture in pictures:
-            frame = av.VideoFrame.from_ndarray(picture, format="gray16le")
-            container.mux(stream.encode(frame.reformat(format=pixels)))
-        container.mux(stream.encode(None))
-    return path
+    return write_numbered(path, pictures=pictures, codec="ffv1", pixels=pixels)
 
 
 def heat(*, body=30_500):
@@ -303,42 +285,36 @@ def test_a_sensor_of_twelve_bits_has_levels_of_its_own(tmp_path):
     assert "levels 1769.5 to 1833.5" in " ".join(source.notes)
 
 
-def test_sixteen_bit_pictures_of_a_folder_are_stretched_too(tmp_path):
-    """Of a thermal camera's TIFF files nothing would be seen."""
-    for number in range(3):
-        cv2.imwrite(str(tmp_path / f"{number}.tiff"), heat())
-    source, pictures = play(tmp_path)
-    assert pictures[0][60, 70, 0] - np.median(pictures[0]) > 150
-    assert "stretched" in " ".join(source.notes)
-
-
-@pytest.mark.parametrize("unseen", [np.nan, np.inf, -np.inf, None])
-def test_pictures_of_degrees_are_stretched_too(tmp_path, unseen):
+@pytest.mark.parametrize("unseen", [np.nan, np.inf, -np.inf, np.uint16, np.int32])
+def test_pictures_of_heat_in_a_folder_are_stretched_too(tmp_path, unseen):
     """Thermal converters write 32 bits (opencv#7025): they were unreadable, or all black; one alone was still."""
     levels = heat().astype(np.float32) / 100 - 273.15
-    if unseen is not None:
+    if isinstance(unseen, float):
         levels[:9] = unseen
         cv2.imwrite(str(tmp_path / "0.tiff"), levels)
     else:
-        Image.fromarray(heat().astype(np.int32)).save(tmp_path / "0.tiff")
+        Image.fromarray(heat().astype(unseen)).save(tmp_path / "0.tiff")
     for place in (tmp_path, tmp_path / "0.tiff"):
-        _, pictures = play(place)
+        source, pictures = play(place)
         assert pictures[0][60, 70, 0] - np.median(pictures[0]) > 150
+        assert "stretched" in " ".join(source.notes)
 
 
-def test_missing_numbers_of_a_folder_are_said(tmp_path):
-    """Whatever follows comes too early, and poses do not fit any more."""
-    for number in (*range(6), *range(9, 12)):
-        cv2.imwrite(str(tmp_path / f"f{number:04d}.png"), numbered(number))
-    source, _ = play(tmp_path)
-    assert "3 numbers are missing, the first after f0005.png" in " ".join(source.notes)
-
-
-def test_pictures_named_by_their_times_come_in_order(tmp_path):
-    """A script that writes str(time) shortens it: of 9.05 and 9.5 the second came first."""
-    for number, name in enumerate(("9.05", "9.1", "9.5", "9.55", "10.0", "10.05")):
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        # Whatever follows comes too early, and poses do not fit any more.
+        ("f0001 f0002 f0003 f0004 f0008 f0009", "3 numbers are missing, the first after f0004.png"),
+        ("9.05 9.1 9.5 9.55 10.0 10.05", ""),  # a script that writes str(time) shortens it
+    ],
+)
+def test_pictures_come_in_the_order_of_their_numbers_or_times(tmp_path, names, says):
+    """Of 9.05 and 9.5 the second came first, or the pictures that are missing were not said."""
+    for number, name in enumerate(names.split()):
         cv2.imwrite(str(tmp_path / f"{name}.png"), numbered(number))
-    assert numbers(play(tmp_path)[1]) == list(range(6))
+    source, pictures = play(tmp_path)
+    assert numbers(pictures) == list(range(6))
+    assert says in " ".join(source.notes)
 
 
 @pytest.mark.parametrize("pixels", ["yuv420p10le", "gbrp10le"])
@@ -370,16 +346,14 @@ def test_untagged_colour_goes_by_height(tmp_path, size, standard):
     """The same car would be of another red in every second clip."""
     green = np.full((size[1], size[0], 3), (0, 191, 0), np.uint8)
     frame = av.VideoFrame.from_ndarray(green, format="bgr24")
-    matrix = 1 if standard == "BT.709" else 5
-    coded = frame.reformat(format="yuv420p", dst_colorspace=matrix)
-    clip = tmp_path / "a.mkv"
-    with av.open(str(clip), "w") as container:
+    coded = frame.reformat(format="yuv420p", dst_colorspace=1 if standard == "BT.709" else 5)
+    coded.colorspace = 2
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
         stream = container.add_stream("ffv1", rate=30)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        coded.colorspace = 2
         container.mux(stream.encode(coded))
         container.mux(stream.encode(None))
-    source, pictures = play(clip)
+    source, pictures = play(tmp_path / "a.mkv")
     assert patch(pictures[0], right=False) == pytest.approx((0, 191, 0), abs=6)
     assert f"no colour matrix: {standard}, because it has {size[1]} lines" in " ".join(source.notes)
 
@@ -431,37 +405,27 @@ def test_what_is_there_is_a_file_whatever_its_name(tmp_path, monkeypatch, name):
 
 def test_an_mp4_without_its_index_says_what_it_is(tmp_path):
     """Whose drone fell would hear that the file is no video."""
-    whole = write_numbered(tmp_path / "a.mp4", 30).read_bytes()
-    cut = tmp_path / "cut.mp4"
-    cut.write_bytes(whole[: whole.index(b"moov") - 4])
+    clip = write_numbered(tmp_path / "cut.mp4", 30)
+    clip.write_bytes(clip.read_bytes().partition(b"moov")[0][:-4])
     with pytest.raises(UserError, match=r"cut\.mp4' is unfinished: .*index \(moov\)"):
-        play(cut)
+        play(clip)
 
 
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("a.mp4", {"movflags": "faststart"}),
-        ("b.mp4", {"movflags": "frag_keyframe+empty_moov"}),
-        ("a.mkv", {}),
-        ("a.ts", {}),
+        *(("a.mp4", {"movflags": flags}) for flags in ("faststart", "frag_keyframe+empty_moov")),
+        *((name, {}) for name in ("a.mkv", "a.ts")),
     ],
 )
 def test_a_cut_clip_says_that_it_is_unfinished(tmp_path, caplog, name, options):
     """Half of a clip would pass for a whole one."""
-    clip = tmp_path / name
-    with av.open(str(clip), "w", options=options) as container:
-        stream = container.add_stream("libx264", rate=30, options={"g": "10", "bf": "0"})
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-        for number in range(150):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
-        container.mux(stream.encode(None))
+    clip = write_numbered(tmp_path / name, 150, muxer=options, g="10", bf="0")
     play(clip)
     assert "unfinished" not in caplog.text
     data = clip.read_bytes()
     clip.write_bytes(data[: len(data) * 6 // 10 | 1])
-    _, pictures = play(clip)
-    assert 30 < len(pictures) < 150
+    assert 30 < len(play(clip)[1]) < 150
     assert f"{name} is unfinished: " in caplog.text
 
 
@@ -495,17 +459,8 @@ def test_a_file_that_grows_is_followed(tmp_path, monkeypatch):
     assert sum(slept) < 2.5 * container.QUIET_S, "once where stamps are looked at, once at the end"
 
 
-def test_a_clip_that_goes_before_it_is_played_is_said(tmp_path):
-    """Whose stick was pulled while the edge waited for a ground would read a traceback."""
-    clip = write_numbered(tmp_path / "a.ts", 5)
-    with open_source(str(clip), size=lambda size: size, fps=30) as source:
-        clip.unlink()
-        with pytest.raises(UserError, match=r"can be read \(No such file or directory\)"):
-            next(source.frames(start_ns=0))
-
-
-def test_a_file_that_has_grown_says_how_to_follow_it(tmp_path, caplog):
-    """It would end early, and nobody know why."""
+def test_a_clip_that_has_grown_or_gone_since_it_was_opened_is_said(tmp_path, caplog):
+    """It would end early, and nobody know why; whose stick was pulled would read a traceback."""
     clip = write_numbered(tmp_path / "a.ts", 60, bf="0")
     with open_source(str(clip), size=lambda size: size, fps=30) as source:
         frames = source.frames(start_ns=0)
@@ -513,6 +468,9 @@ def test_a_file_that_has_grown_says_how_to_follow_it(tmp_path, caplog):
         with clip.open("ab") as file:
             file.write(bytes(188))
         list(frames)
+        clip.unlink()
+        with pytest.raises(UserError, match=r"can be read \(No such file or directory\)"):
+            next(source.frames(start_ns=0))
     assert "it has grown by 188 bytes since: --follow waits for more" in caplog.text
 
 

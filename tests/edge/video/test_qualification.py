@@ -11,7 +11,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoder import encoder_settings
-from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, measure, run_frames
+from hvt_edge.video.qualification import Allowed, allowed, headroom_of, measure, run_frames
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, hard_pictures
 
@@ -39,7 +39,6 @@ class Garbled(BaseEncoder):
     """Loses the end of each unit but the keyframes."""
 
     def encode(self, frame: Frame, **how: Any) -> AccessUnit:
-        """See there."""
         unit = super().encode(frame, **how)
         return unit if unit.keyframe else replace(unit, data=unit.data[:3])
 
@@ -79,47 +78,33 @@ def test_the_fullest_window_is_any_window():
     assert found.window_bytes == 15 * (5000 + header)
 
 
-def test_an_encoder_that_keeps_to_its_rate_is_taken_as_it_is():
-    """Bits that the budget has would stay unused."""
-    assert headroom() == 1.0
+@pytest.mark.parametrize("scene", [SCENE, ()])
+def test_an_encoder_that_keeps_to_its_rate_is_taken_as_it_is(scene):
+    """Bits that the budget has would stay unused, or Ctrl-C before the first frame blame the encoder."""
+    assert headroom(scene=scene) == 1.0
 
 
 def test_one_that_takes_half_as_much_again_is_asked_for_less():
     """Every picture would wait for the budget's window, and stills find no room."""
     share = headroom(factor=1.5)
     assert 0.5 <= share < 0.85
-    units = [
-        encoder.encode(frame, keyframe=frame.index in (0, 22))
-        for encoder in [opened(share, factor=1.5)]
-        for frame in SCENE
-    ]
+    encoder = opened(share, factor=1.5)
+    units = [encoder.encode(frame, keyframe=frame.index in (0, 22)) for frame in SCENE]
     assert measure(units, limit(), edge_id="edge-1").overshoot(limit()) <= 1
 
 
-def test_one_that_does_not_obey_is_refused_with_its_figure():
-    """Nobody would learn why the picture is late all the time."""
-    with pytest.raises(
-        UserError,
-        match=r"--encoder acme overshoots: its fullest 1 s took .* of the 345 kbps that .* or raise",
-    ):
-        headroom(least_bps=3_000_000)
-
-
-def test_one_that_obeys_too_late_is_refused_though_it_was_asked_for_less():
-    """Headroom that does not help would be given all the same."""
-    with pytest.raises(UserError, match=r"too much with its target lowered to \d\d%"):
-        headroom(least_bps=450_000)
-
-
-def test_one_whose_units_are_no_pictures_is_refused():
-    """A flight would begin whose picture is garbage all the time."""
-    says = (
-        r"--encoder acme does not work here \(ValueError: its unit of frame 1 gives no picture.*: take x265"
-    )
-    with pytest.raises(UserError, match=says):
-        headroom(kind=Garbled)
-
-
-def test_no_scene_is_no_fault():
-    """Ctrl-C before the first frame would blame the encoder."""
-    assert headroom(scene=()) == 1.0
+@pytest.mark.parametrize(
+    ("behaviour", "says"),
+    [
+        ({"least_bps": 3_000_000}, "overshoots: its fullest 1 s took .* of the 345 kbps that .* or raise"),
+        ({"least_bps": 450_000}, r"overshoots: .*, and too much with its target lowered to \d\d%"),
+        (
+            {"kind": Garbled},
+            r"does not work here \(ValueError: its unit of frame 1 gives no picture.*: take x265",
+        ),
+    ],
+)
+def test_one_that_does_not_obey_or_gives_no_pictures_is_refused_with_its_figure(behaviour, says):
+    """A flight would begin whose picture is late, or garbage, all the time, and nobody learn why."""
+    with pytest.raises(UserError, match=f"--encoder acme {says}"):
+        headroom(**behaviour)

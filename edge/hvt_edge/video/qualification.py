@@ -39,7 +39,6 @@ class Allowed:
 
     window_bytes: int
     window_frames: int
-    """Coded frames in a window."""
     window_s: float
     keyframe_bytes: int
 
@@ -49,9 +48,7 @@ class Measured:
     """The measured bytes of an encoder, in line bytes."""
 
     window_bytes: int
-    """Bytes of the fullest window."""
     keyframe_bytes: int
-    """Bytes of the largest keyframe."""
 
     def overshoot(self, limit: Allowed) -> float:
         """The larger of both ratios to the limits; above 1 is too much."""
