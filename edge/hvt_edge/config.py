@@ -524,14 +524,12 @@ def _check_window(config: EdgeConfig) -> None:
 
 
 def _check_passthrough(config: EdgeConfig) -> None:
-    if config.size == AUTO:
-        raise UserError(
-            "--size auto is not accepted with --encoder passthrough, which sends the camera's own size: leave it out"
-        )
-    if config.video_share == AUTO:
-        raise UserError(
-            "--video-share auto is not accepted with --encoder passthrough, whose rate is the camera's: give a share"
-        )
+    for flag, value, why in (
+        ("--size", config.size, "which sends the camera's own size: leave it out"),
+        ("--video-share", config.video_share, "whose rate is the camera's: give a share"),
+    ):
+        if value == AUTO:
+            raise UserError(f"{flag} auto is not accepted with --encoder passthrough, {why}")
 
 
 def _check_stills(config: EdgeConfig) -> None:

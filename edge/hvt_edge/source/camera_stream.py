@@ -220,26 +220,20 @@ def open_units(name: str, stream: Any) -> CameraUnits:
 
 def check_stream(name: str, stream: Any) -> None:
     """Raise `UserError` if an open stream cannot be the base stream, with the accepted ones."""
-    codec = stream.codec_context
+    codec, fault = stream.codec_context, ""
+    aspect = None if codec is None else stream.sample_aspect_ratio or codec.sample_aspect_ratio
+    takes = "and --encoder passthrough takes"
     if codec is None or codec.name != "hevc":
-        said = "no codec that is known" if codec is None else codec.name
-        raise UserError(f"source {name} is {said}, and --encoder passthrough takes HEVC alone: {REENCODE}")
-    if codec.pix_fmt not in _FORMATS:
-        raise UserError(
-            f"source {name} is HEVC {codec.profile or ''} in {codec.pix_fmt}, and --encoder passthrough takes Main, "
-            f"4:2:0 in 8 bits: set the camera to Main, or {REENCODE}"
-        )
-    aspect = stream.sample_aspect_ratio or codec.sample_aspect_ratio
-    if aspect and not 0.99 < aspect < 1.01:
-        raise UserError(
-            f"source {name} has pixels that are {float(aspect):.2f} times as wide as high, which --encoder "
-            f"passthrough cannot mend: {REENCODE}"
-        )
-    if codec.has_b_frames:
-        raise UserError(
-            f"source {name} sends pictures in another order than they are shown (B-frames), which --encoder "
-            f"passthrough does not take: switch them off in the camera, or {REENCODE}"
-        )
+        fault = f"is {codec.name if codec else 'no codec that is known'}, {takes} HEVC alone: "
+    elif codec.pix_fmt not in _FORMATS:
+        has = f"HEVC {codec.profile or ''} in {codec.pix_fmt}"
+        fault = f"is {has}, {takes} Main, 4:2:0 in 8 bits: set the camera to Main, or "
+    elif aspect and not 0.99 < aspect < 1.01:
+        fault = f"has pixels that are {float(aspect):.2f} times as wide as high, {takes} square ones: "
+    elif codec.has_b_frames:
+        fault = f"shows pictures in another order than it sends them (B-frames), {takes} none: switch them off, or "
+    if fault:
+        raise UserError(f"source {name} {fault}{REENCODE}")
 
 
 def check_picture(name: str, picture: av.VideoFrame, *, size: BaseSize) -> str:

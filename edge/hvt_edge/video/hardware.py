@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from fractions import Fraction
 
 import av.error
 from av.video.frame import PictureType
@@ -29,11 +28,7 @@ class HardwareEncoder:
         self._to_yuv = VideoReformatter()
         self._count = 0
         self.mean_qp = math.nan
-        context = encoder_context(row.codec)
-        context.width, context.height = settings.size
-        context.pix_fmt = row.pixel_format
-        context.framerate = Fraction(settings.fps).limit_denominator(100_000)
-        context.time_base = 1 / context.framerate
+        context = encoder_context(row.codec, settings, pixel_format=row.pixel_format)
         context.bit_rate = settings.bitrate_bps
         context.gop_size = _GOP_FRAMES
         context.color_primaries = context.color_trc = context.colorspace = _BT709

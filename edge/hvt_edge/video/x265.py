@@ -318,8 +318,8 @@ def mean_qp_of(packet: av.Packet[Any]) -> float:
     return int.from_bytes(stats[:4], "little") / _QP_TO_LAMBDA
 
 
-def encoder_context(name: str) -> VideoCodecContext:
-    """An encoder of FFmpeg; raises `UserError` if FFmpeg was built without it."""
+def encoder_context(name: str, settings: EncoderSettings, *, pixel_format: str) -> VideoCodecContext:
+    """An encoder of FFmpeg, not open; raises `UserError` if FFmpeg was built without it."""
     try:
         context = av.CodecContext.create(name, "w")
     except (av.error.FFmpegError, ValueError):
@@ -327,6 +327,10 @@ def encoder_context(name: str) -> VideoCodecContext:
             f"PyAV {av.__version__} has no encoder {name}: install its wheel from PyPI, which brings one"
         ) from None
     assert isinstance(context, VideoCodecContext)
+    context.width, context.height = settings.size
+    context.pix_fmt = pixel_format
+    context.framerate = Fraction(settings.fps).limit_denominator(100_000)
+    context.time_base = 1 / context.framerate
     return context
 
 
@@ -365,11 +369,7 @@ def _opened(settings: EncoderSettings) -> VideoCodecContext:
         parameters |= {"aq-mode": 1, "aq-strength": 0.01}
     if settings.size[1] <= _FEW_ROWS_PX and settings.vbv_s * settings.fps < _SHALLOW_FRAMES:
         parameters["ctu"] = 32
-    context = encoder_context("libx265")
-    context.width, context.height = settings.size
-    context.pix_fmt = "yuv420p"
-    context.framerate = Fraction(settings.fps).limit_denominator(100_000)
-    context.time_base = 1 / context.framerate
+    context = encoder_context("libx265", settings, pixel_format="yuv420p")
     context.bit_rate = kbps * 1000
     context.options = {
         "preset": settings.preset,

@@ -24,40 +24,13 @@ from hvt_edge.loop.counts import CpuMeter, FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating import Keyframes, LoopClock
-from hvt_edge.perception.cpu_budget import CpuBudget
-from hvt_edge.stills.outbox import Outbox
 from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.video.stage import Action, FrameDecision
 from media.clips import framed, smooth_pictures
-from rigs.world import Puts, make_base_stage, make_transmitter
+from rigs.world import Puts, QuietStills, make_base_stage, make_transmitter
 
 SIZE = (128, 96)
 FRAMES = list(framed(smooth_pictures(40, size=SIZE)))
-
-
-class Unmoved:
-    """Perception that finds nothing."""
-
-    latest_tracks, outbox, analyzer = None, Outbox(), SimpleNamespace(cpu_budget=CpuBudget())
-
-    def capture(self, frame):
-        """Nobody asks for a still of it."""
-
-    def is_used(self, capture_ns):
-        """Somebody looks at what comes of it."""
-        return True
-
-    def analyze(self, frame, unit, skipped=()):
-        return frame.index
-
-    def send_requested(self, *, now_ns, held):
-        return set()
-
-    def step(self, seen, *, now_ns, held=None):
-        return set()
-
-    def on_results(self, results, *, detected=None):
-        """Nothing."""
 
 
 class DrawnUnits:
@@ -91,18 +64,14 @@ class Flight:
             failures=Failures(time.time_ns),
         )
         common = {"inbox": inbox, "fps": 15, "counts": self.counts, "has_viewer": lambda: self.has_viewer}
+        common["stop"] = threading.Event()
         self.now_ns = FRAMES[0].capture_ns
-        self.pace = (
-            LockstepPace(
-                self.stage, Unmoved(), keyframes=keyframes, clock=LoopClock(lambda: 0, lockstep=True),
-                has_ground=lambda: False, stop=threading.Event(), **common,
-            )
-            if lockstep
-            else RealtimePace(
-                self.stage, Unmoved(), clock=lambda: self.now_ns, live=source == "camera", stop=threading.Event(),
-                failures=Failures(time.time_ns), **common,
-            )
-        )  # fmt: skip
+        if lockstep:
+            common |= {"keyframes": keyframes, "clock": LoopClock(lambda: 0, lockstep=True)}
+            self.pace = LockstepPace(self.stage, QuietStills(), has_ground=lambda: False, **common)
+        else:
+            common |= {"clock": lambda: self.now_ns, "live": source == "camera"}
+            self.pace = RealtimePace(self.stage, QuietStills(), failures=Failures(time.time_ns), **common)
         self.counts.begin(self)
 
     @property

@@ -19,7 +19,7 @@ from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
 from rigs.messages import counted, feedback
-from rigs.world import Puts, make_base_stage, make_transmitter
+from rigs.world import Puts, QuietStills, make_base_stage, make_transmitter
 
 SIZE = (320, 192)
 
@@ -47,34 +47,8 @@ class Ground:
         self.inbox.on_report(counted(report, now_ns=1))
 
 
-class Stills:
-    """Notes what it was given; sends nothing."""
-
-    def __init__(self) -> None:
-        self.seen: list[tuple[int, int | None]] = []
-        self.latest_tracks = None
-        self.sends = 0
-        self.detected: list[tuple[int, int]] = []
-
-    def analyze(self, frame, unit):
-        self.seen.append((frame.index, unit and unit.frame_index))
-        return frame.index
-
-    def send_requested(self, *, now_ns, held):
-        return set()
-
-    def step(self, seen, *, now_ns, held):
-        self.sends += 1
-        return set()
-
-    def on_results(self, results, *, detected=None):
-        """Keep which frame the ground spoke of, and after how many frames."""
-        if detected is not None:
-            self.detected.append((self.sends, detected.frame_index))
-
-
 def paced(
-    link: Any, stills: Stills, inbox: FeedbackInbox, *, fps: float, **parts: Any
+    link: Any, stills: QuietStills, inbox: FeedbackInbox, *, fps: float, **parts: Any
 ) -> tuple[LockstepPace, LoopClock]:
     """A loop in which every third of ``fps`` frames is coded, and its clock."""
     keyframes, clock = Keyframes(), LoopClock(lambda: 0, lockstep=True)
@@ -93,7 +67,7 @@ def paced(
 
 def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
     """With ``--fps auto`` a run in lockstep would stand still for 20 s at the first frame that was never sent."""
-    ground, stills, counts = Ground(), Stills(), FrameCounts()
+    ground, stills, counts = Ground(), QuietStills(), FrameCounts()
     pace, clock = paced(ground, stills, ground.inbox, fps=15, counts=counts)
     with pace:
         for frame in framed(smooth_pictures(50, size=SIZE)):
@@ -103,7 +77,8 @@ def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
     assert stills.seen == [(index, None if index % 3 else index) for index in range(50)]
     assert counts.encoded == 17
     # The ground is always done at once; what it says of a frame counts a second later, in every run the same.
-    assert stills.detected == [*((frame + 15, frame) for frame in range(0, 35, 3)), (50, 48)]
+    said = [(steps, detected.frame_index) for steps, detected in stills.detected]
+    assert said == [*((frame + 15, frame) for frame in range(0, 35, 3)), (50, 48)]
 
 
 class Silent(FeedbackInbox):
@@ -123,14 +98,8 @@ class Silent(FeedbackInbox):
 def test_a_ground_that_never_answers_is_waited_for_once(subscribed, stops, tenths):
     """A long run of a study, or Ctrl-C, would hang on a ground that crashed: seconds for each of its frames."""
     inbox, stop, there = Silent(), threading.Event(), [True]
-    pace, _ = paced(
-        Puts(),
-        Stills(),
-        inbox,
-        fps=3,
-        stop=stop,
-        has_ground=lambda: subscribed or bool(there and there.pop()),
-    )
+    has_ground = lambda: subscribed or bool(there and there.pop())  # noqa: E731
+    pace, _ = paced(Puts(), QuietStills(), inbox, fps=3, stop=stop, has_ground=has_ground)
     if stops:
         stop.set()
     with pace:

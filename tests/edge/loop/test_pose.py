@@ -38,11 +38,12 @@ def fly(table: PoseTable, *, seconds: int, fps: int = 15, full_ns: range = range
     return sent, failures
 
 
+MINUTE = [Pose(0, 52.0, 13.0, height_m=80.0), Pose(60 * SECOND_NS, 52.01, 13.01, height_m=90.0)]
+
+
 def test_it_is_told_once_a_second_and_within_300_bits():
     """It would eat the stills of a thin link."""
-    ends = [Pose(0, 52.0, 13.0, height_m=80.0), Pose(60 * SECOND_NS, 52.01, 13.01, height_m=90.0)]
-    table = PoseTable(ends, most_gap_s=99)
-    sent, failures = fly(table, seconds=60)
+    sent, failures = fly(PoseTable(MINUTE, most_gap_s=99), seconds=60)
     bits = 8 * sum(len(data) for _, data in sent.messages)
     assert 50 <= len(sent.messages) <= 60
     assert bits / 60 <= 300
@@ -55,9 +56,8 @@ def test_it_is_told_once_a_second_and_within_300_bits():
 
 def test_without_room_it_is_told_at_the_next_frame_and_understood():
     """A ground would read changes of a report that never came, and show no place for ten seconds."""
-    ends = [Pose(0, 52.0, 13.0, height_m=80.0), Pose(60 * SECOND_NS, 52.01, 13.01, height_m=90.0)]
     full_ns = range(START_NS + 5 * SECOND_NS // 2, START_NS + 9 * SECOND_NS // 2)
-    sent, _ = fly(PoseTable(ends, most_gap_s=99), seconds=8, full_ns=full_ns)
+    sent, _ = fly(PoseTable(MINUTE, most_gap_s=99), seconds=8, full_ns=full_ns)
     decoder = PoseDecoder()
     assert all(decoder.decode(PoseReport.parse(data)) is not None for _, data in sent.messages)
     after = [at for at, _ in sent.messages if at >= full_ns.stop]
@@ -86,9 +86,6 @@ class Broken:
     def at(self, media_ns, *, capture_ns):
         if self.error is not None:
             raise self.error
-
-    def close(self):
-        pass
 
 
 @pytest.mark.parametrize("error", [ValueError("hm"), SystemExit(1), None])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import pytest
 
@@ -19,14 +18,13 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.perception.cpu_budget import CpuBudget
-from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from programs.processes import eventually
 from rigs.messages import counted, feedback
-from rigs.world import make_base_stage, make_transmitter
+from rigs.world import QuietStills, make_base_stage, make_transmitter
 
 SIZE = (320, 192)
 
@@ -61,39 +59,24 @@ class Out:
         self.headers.append(BaseHeader.parse(attachment, payload))
 
 
-class BlockedStills:
+class BlockedStills(QuietStills):
     """Decodes what it is given; sending its first still takes until it is released."""
 
-    def __init__(self, *, released: bool = True) -> None:
-        self.latest_tracks, self.outbox = None, Outbox()
-        self.released, self.decoder = threading.Event(), BaseDecoder()
-        self.frames: list[int] = []
-        self.decoded = 0
-        self.detected: list[int] = []
-        self.analyzer = SimpleNamespace(cpu_budget=CpuBudget())
-        if released:
-            self.released.set()
-
-    def capture(self, frame):
-        """Nobody asks for a still of it."""
-
-    def is_used(self, capture_ns):
-        return True
+    def __init__(self) -> None:
+        super().__init__()
+        self.released, self.decoder, self.decoded = threading.Event(), BaseDecoder(), 0
 
     def analyze(self, frame, unit, skipped=()):
         for one in (*skipped, unit):
             self.decoded += self.decoder.decode(one.data) is not None
-        self.frames.append(frame.index)
+        return super().analyze(frame, unit)
 
-    def step(self, seen, *, now_ns):
+    def step(self, seen, **moment):
         assert self.released.wait(60)
-
-    def on_results(self, results, *, detected=None):
-        if detected is not None:
-            self.detected.append(detected.objects)
+        return super().step(seen, **moment)
 
 
-def paced(out: Out, stills: BlockedStills, **parts) -> RealtimePace:
+def paced(out: Out, stills: QuietStills, **parts) -> RealtimePace:
     """The loop of a clip at 15 frames a second, with real x265; ``parts`` are in place of its own."""
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=100_000, preset="ultrafast"))
     plain = {"inbox": FeedbackInbox(), "clock": out.time, "stop": out.time, "failures": Failures(out.time)}
@@ -103,7 +86,7 @@ def paced(out: Out, stills: BlockedStills, **parts) -> RealtimePace:
 
 def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
     """The picture would freeze a second after a still met a full link, and thaw when the link does."""
-    out, stills, inbox = Out(), BlockedStills(released=False), FeedbackInbox()
+    out, stills, inbox = Out(), BlockedStills(), FeedbackInbox()
     inbox.on_report(counted(feedback(last_frame_index=0, objects_detected=7), now_ns=1))
     frames = list(framed(smooth_pictures(60, size=SIZE)))
     with paced(out, stills, inbox=inbox, clock=SteadyClock(), live=True, stop=threading.Event()) as pace:
@@ -114,15 +97,16 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
         stills.released.set()
         for frame in frames[50:]:
             pace.step(frame)
-        eventually(lambda: stills.detected == [7] and stills.decoded > max(stills.frames, default=99))
+        eventually(lambda: len(stills.seen) == 60 - pace.counts.unanalyzed)
     assert len(out.headers) == 60
-    assert stills.decoded == max(stills.frames) + 1, "no unit is missing before any frame that was analyzed"
+    assert [said.objects for _, said in stills.detected] == [7]
+    assert stills.decoded == max(stills.seen)[0] + 1, "no unit is missing before any frame that was analyzed"
 
 
 def test_frames_missed_count_for_the_link_or_for_the_machine():
     """Who flies would buy a faster computer for a thin link."""
     out, (first, second, third, fourth) = Out(), framed(smooth_pictures(4, size=SIZE))
-    with paced(out, BlockedStills(), live=True) as pace:
+    with paced(out, QuietStills(), live=True) as pace:
         counts = pace.counts
         pace.step(first, missed=4)
         assert counts.groups == {"sent": 1}, "what came before the first is nobody's fault"
@@ -143,7 +127,7 @@ def play_clip(
 
     One frame in ``slow`` takes two and a half times the time between two.
     """
-    with paced(out, BlockedStills()) as pace:
+    with paced(out, QuietStills()) as pace:
         for index, frame in enumerate(framed(smooth_pictures(1, size=SIZE) * frames)):
             out.time.pass_s(2.5 / 15 if index % slow == slow - 1 else reading_s)
             pace.step(replace(frame, camera_unit=unit(index)) if coded else frame)
@@ -201,7 +185,7 @@ def test_the_detector_does_not_begin_just_before_a_keyframe_nor_waits_for_one_fo
     frames, due_from_s, waits
 ):
     """Both together take longer than the frames behind them can wait; for two seconds, boxes were three old."""
-    stills, found = BlockedStills(), []
+    stills, found = QuietStills(), []
     with paced(Out(), stills) as pace:
         if due_from_s is not None:
             pace.base.keyframes.due = lambda now_ns: now_ns >= START_NS + due_from_s * SECOND_NS
@@ -226,7 +210,7 @@ class AskedBudget(CpuBudget):
 @pytest.mark.parametrize(("waits_s", "reading_s", "late"), [(1 / 15, 0.0, False), (0.0, 1 / 15, True)])
 def test_perception_gives_way_to_a_slow_machine_alone(waits_s, reading_s, late):
     """Where video took all of the budget, each frame waited for its room: an idle machine had no boxes for good."""
-    out, stills = Out(lambda count: waits_s if count else 0.12), BlockedStills()
+    out, stills = Out(lambda count: waits_s if count else 0.12), QuietStills()
     stills.analyzer.cpu_budget = budget = AskedBudget()
     with paced(out, stills) as pace:
         for frame in framed(smooth_pictures(1, size=SIZE) * 60):

@@ -90,7 +90,7 @@ def test_what_is_damaged_is_left_out_up_to_the_next_keyframe(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("made", "size", "says"),
     [
-        ({"bframes": 3}, None, r"in another order than they are shown \(B-frames\)"),
+        ({"bframes": 3}, None, r"in another order than it sends them \(B-frames\)"),
         (
             {"pixel_format": "yuv420p10le"},
             None,

@@ -222,7 +222,7 @@ def test_in_lockstep_a_failing_encoder_is_an_error():
 def test_no_encoder_at_all_is_one_sentence():
     """A build of PyAV without x265 would end in a traceback."""
     with pytest.raises(UserError, match=r"PyAV .* has no encoder libx265-lost"):
-        encoder_context("libx265-lost")
+        encoder_context("libx265-lost", SETTINGS, pixel_format="yuv420p")
 
 
 def test_a_keyframe_that_no_window_holds_is_coded_again_with_less_detail():

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader, RoiHeader
 from hvt_common.runtime.failures import Failures
-from hvt_common.values import Frame, View
+from hvt_common.values import AccessUnit, Frame, View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.feedback import Detected
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Keyframes, Operating
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.source.contract import Source
 from hvt_edge.stills.maker import StillMaker
@@ -62,6 +65,40 @@ class Puts:
         return [
             (RoiHeader.parse(extra, data), data) for row, data, extra, _ in self.puts if row is Channel.ROI
         ]
+
+
+class QuietStills:
+    """Perception and stills of a frame loop, which find and send nothing."""
+
+    def __init__(self) -> None:
+        self.latest_tracks, self.outbox = None, Outbox()
+        self.analyzer = SimpleNamespace(cpu_budget=CpuBudget())
+        self.seen: list[tuple[int, int | None]] = []
+        """(frame, unit) of all that was analyzed, by their indices."""
+        self.steps = 0
+        self.detected: list[tuple[int, Detected]] = []
+        """(steps by then, what the ground has said)."""
+
+    def capture(self, frame: Frame) -> None:
+        """Nobody requests a still of it."""
+
+    def is_used(self, _capture_ns: int) -> bool:
+        return True
+
+    def analyze(self, frame: Frame, unit: AccessUnit | None, _skipped: Sequence[AccessUnit] = ()) -> int:
+        self.seen.append((frame.index, None if unit is None else unit.frame_index))
+        return frame.index
+
+    def send_requested(self, **_moment: Any) -> set[int]:
+        return set()
+
+    def step(self, _seen: int, **_moment: Any) -> set[int]:
+        self.steps += 1
+        return set()
+
+    def on_results(self, _results: object, *, detected: Detected | None = None) -> None:
+        if detected is not None:
+            self.detected.append((self.steps, detected))
 
 
 def make_transmitter(
