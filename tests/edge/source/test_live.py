@@ -110,6 +110,9 @@ class Camera:
     def shot(self, at_ns: int | None = None) -> Shot:
         return Shot(partial(np.zeros, (48, 64, 3), np.uint8), at_ns)
 
+    def grab(self) -> Shot:
+        return self.shot()
+
 
 class SaysItsTimeLater(Camera):
     """It says no time until it is opened again, and then that each of its frames is four seconds old."""
