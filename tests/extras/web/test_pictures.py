@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from dataclasses import replace
 from unittest.mock import MagicMock
 
@@ -211,6 +212,8 @@ def test_every_picture_comes_back_from_the_fragments(codec, kind):
         frames = list(container.decode(video=0))
     assert len(frames) == len(given)
     assert (frames[0].width, frames[0].height) == SIZE
+    track = out.getvalue().index(b"tkhd")  # players that lay out a page by the track would stretch it
+    assert struct.unpack_from(">HxxH", out.getvalue(), track + 80) == SIZE
     times = [frame.time for frame in frames]
     assert times == pytest.approx([index / FPS for index in range(len(given))], abs=1e-3)
 
