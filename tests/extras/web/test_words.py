@@ -377,7 +377,7 @@ ANSWERS = {
     "… is too little for …: it takes at least …",
     "…: … is a whole number from … to …, not …",
     "…: … is missing",
-    "…: … is missing, or not a word",
+    "…: … is a word, not …",
     "… takes no …",
     "the rates were changed a moment ago: wait two seconds",
     "no frame was looked at yet, or none is kept (--ring)",
