@@ -82,11 +82,12 @@ def assign(cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
 def _assign(rows: _Indices, columns: _Indices, cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
     # From the pairs under the limit.
     by_row, by_column = np.bincount(rows), np.bincount(columns)
-    alone = by_row.take(rows) * by_column.take(columns) == 1
-    others = (~alone).nonzero()[0]
+    crowd = by_row.take(rows) * by_column.take(columns)
+    others = (crowd > 1).nonzero()[0]
     if not len(others):
         return rows, columns
-    lone_rows, lone_columns = rows[alone], columns[alone]
+    alone = (crowd == 1).nonzero()[0]
+    lone_rows, lone_columns = rows.take(alone), columns.take(alone)
     by_row[lone_rows] = by_column[lone_columns] = 0
     open_rows, open_columns = by_row.nonzero()[0], by_column.nonzero()[0]
     contested = np.full((len(open_rows), len(open_columns)), limit + 1)
@@ -113,7 +114,7 @@ def pair(similar: Overlaps, tracks: _Mask, free: _Mask, match: _Indices, *, limi
 
     Writes the detections into ``match`` and takes them out of ``free``, in place.
     """
-    if not np.count_nonzero(tracks):
+    if not (np.count_nonzero(tracks) and np.count_nonzero(free)):
         return
     rows, columns = similar.rows, similar.columns
     cost = 1 - similar.iou

@@ -265,7 +265,14 @@ class ByteTracker:
             table.phase[late] = OVER_TIME
             # The authors' program matches a frame longer (it sweeps one update late): the same at any rate.
             stale = (table.seen[late] < oldest - 1) & (table.since[late] != self._updated_index)
-            self._table = table.take(np.delete(np.arange(len(table)), late[stale]))
+            if np.count_nonzero(stale):
+                self._table = table.take(np.delete(np.arange(len(table)), late[stale]))
+
+    @property
+    def _fresh_frames(self) -> int:
+        fresh = max(round(_OLD_S * self._fps), _OLD_GAPS * max(self._gaps, default=1))
+        # After the first nobody knows yet when the next update comes.
+        return self._longest_frames if len(self._gaps) == 1 and self._late_frames <= fresh else fresh
 
     def _growth(self, gap: int) -> float:
         # Before its second detection a track has no velocity, and a small object leaves its own box: never confirmed.
@@ -310,11 +317,10 @@ class ByteTracker:
 
     def _listed(self, frame_index: int, boxes: _Floats) -> Tracks:
         table = self._table
-        fresh = max(round(_OLD_S * self._fps), _OLD_GAPS * max(self._gaps, default=1))
-        if len(self._gaps) == 1 and self._late_frames <= fresh:
-            fresh = self._longest_frames  # nobody knows yet when the next update comes
         width, height = boxes[2:] - boxes[:2]
-        listed = (table.phase >= TRACKED) & (table.seen >= frame_index - fresh)
+        listed = table.phase >= TRACKED
+        if frame_index != self._updated_index:
+            listed &= table.seen >= frame_index - self._fresh_frames
         rows = (listed & (width * height > self._settings.min_box_area_px2)).nonzero()[0]
         ids, born, seen, since, _ = table.numbers.take(rows, axis=1)
         scores = table.scores.take(rows, axis=1)

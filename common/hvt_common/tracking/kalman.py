@@ -43,7 +43,7 @@ _INITIAL_FIXED = np.multiply.outer([1e-2**2, 0, 1e-5**2], _ASPECT)
 _PROCESS_BY_HEIGHT = np.multiply.outer([_POSITION_WEIGHT**2, 0, _VELOCITY_WEIGHT**2], _LENGTHS)
 _PROCESS_FIXED = np.multiply.outer([1e-2**2, 0, 1e-5**2], _ASPECT)
 _MEASURED_BY_HEIGHT = _POSITION_WEIGHT**2 * _LENGTHS
-_MEASURED_FIXED = 1e-1**2 * _ASPECT
+_MEASURED_ASPECT = 1e-1**2
 
 _SIZE_DECAY = 0.5
 _MOST_SIZE_STEP = 0.1
@@ -103,9 +103,8 @@ def correct(states: States, measured: _Floats, *, gap: int = 1) -> None:
     over some ten measurements, one a frame; where those are rare, a car that drives into the picture would keep the
     shape of its bonnet for seconds. So a measurement counts for the more, the longer nothing was measured.
     """
-    innovation_var = _MEASURED_BY_HEIGHT * np.square(states[POSITION, 3])
-    innovation_var += _MEASURED_FIXED / gap**2
-    innovation_var += states[VAR_P]
+    innovation_var = states[VAR_P] + _MEASURED_BY_HEIGHT * np.square(states[POSITION, 3])
+    innovation_var[2] += _MEASURED_ASPECT / gap**2
     gain = states[VAR_P:VAR_V] / innovation_var
     states[:VAR_P] += gain * (measured - states[POSITION])
     states[VAR_V] -= gain[1] * states[COV_PV]

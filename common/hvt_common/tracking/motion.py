@@ -102,9 +102,10 @@ def move(table: TrackTable, step: Step, *, frames: int, hold_unconfirmed: bool) 
         # The authors' program matches unconfirmed tracks where they started, without the step to this frame.
         # They are at rest; it only changes the gain of the correction that confirms them.
         held = (table.phase == UNCONFIRMED).nonzero()[0]
-        before = states.take(held, axis=2)
+        before = states.take(held, axis=2) if len(held) else None
         kalman.predict(states)
-        states[:, :, held] = before
+        if before is not None:
+            states[:, :, held] = before
     else:
         kalman.coast(states)
     if step.affine is not None:
