@@ -82,6 +82,8 @@ class Watch(LinkWatch):
         """The time since which a ground has had a link to a peer that it calls; infinite once that is judged."""
         self._first_seen_s: dict[str, float] = {}
         self._named: set[str] = set()
+        self._unserved: dict[str, str] = {}
+        """Whom nothing came of when that was said, and the sentence that takes it back."""
         self._stop = threading.Event()
         self._using = threading.Lock()
         """Held while the session is used, so that it is not closed meanwhile."""
@@ -144,6 +146,8 @@ class Watch(LinkWatch):
                 return True
             try:
                 links = self._session.info.links()
+                for name in [name for name in self._unserved if self._served(name)]:
+                    _log.warning("%s", self._unserved.pop(name))
                 if links:
                     self._check_names(self._names(links), now_s)
                 self._check_second_link(links, now_s)
@@ -219,6 +223,7 @@ class Watch(LinkWatch):
             self._calls_since_s = math.inf
             replies = self._session.liveliness().get(selector(Channel.ALIVE), timeout=_ANSWER_S)
             if not self._served("") and all(one.ok is None for one in replies):
+                self._unserved[""] = "an edge is seen now"
                 _log.warning(
                     "linked to %s, but no edge is seen there: if another ground listens there, it passes nothing on; "
                     "connect to the edge itself, or both grounds to a router (docs/deployment.md)",
@@ -247,6 +252,7 @@ class Watch(LinkWatch):
                 sentence = self._stranger(name)
             elif now_s - since_s > self._patience_s and not router and self._is_hiding(name):
                 sentence = self._hidden(name)
+                self._unserved[name] = f"{self._edge or name} and a ground hear each other now"
             else:
                 continue
             self._named.add(name)

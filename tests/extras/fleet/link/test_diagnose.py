@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 import zenoh
@@ -220,6 +220,31 @@ def test_a_link_that_comes_while_its_lack_is_explored_is_not_missed(caplog: pyte
     with Watch(session, settings, served=lambda _: True, patience_s=0.05, examine=examine):
         eventually(lambda: looks.count(1) > 1)
     assert not caplog.records
+
+
+@pytest.mark.parametrize("side", ["edge", "ground"])
+def test_what_came_late_is_no_lack_of_rights(
+    fleet: Fleet, caplog: pytest.LogCaptureFixture, side: str
+) -> None:
+    """A ground that loaded its models for long was told of for the whole flight, and the operator looked for keys."""
+    name, other = ("uav-1", "base") if side == "edge" else ("base", "uav-1")
+    link = SimpleNamespace(auth_identifier=other, zid="1", src="tcp/127.0.0.1:1", dst="tcp/127.0.0.1:2")
+    info = SimpleNamespace(
+        links=lambda: [link],
+        routers_zid=list,
+        declare_link_events_listener=lambda *_, **__: SimpleNamespace(try_recv=lambda: None),
+    )
+    session = cast("zenoh.Session", SimpleNamespace(info=info))
+    settings = LinkSettings(
+        cast("Any", side), listen=("tls/127.0.0.1:9",), zenoh_config=fleet.file(name),
+        name=name if side == "edge" else None,
+    )  # fmt: skip
+    there: list[bool] = []
+    with Watch(session, settings, served=lambda _: bool(there), patience_s=0.05):
+        eventually(lambda: f"{other!r} is linked, but" in caplog.text)
+        there.append(True)
+        eventually(lambda: "uav-1 and a ground hear each other now" in caplog.text)
+    assert len(caplog.records) == 2
 
 
 def test_a_second_link_that_does_not_come_is_said_once(
