@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import KW_ONLY, dataclass
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import zenoh
 
@@ -88,26 +89,34 @@ class EdgeLink(Outlet, Protocol):
 class ZenohLink:
     """One Zenoh session with publishers of all channels; a context manager.
 
-    Raises `UserError` where a port or an endpoint cannot be used, or another edge with that id is on the link.
+    Once a listener hears nothing any more, the next status message goes through another session. Raises `UserError`
+    where a port or an endpoint cannot be used, or another edge with that id is on the link.
     """
 
     def __init__(
         self, settings: LinkSettings, *, edge_id: str, failures: Failures, clock: Callable[[], int]
     ) -> None:
-        self._failures = failures
+        self._settings, self._failures = settings, failures
         self._keys = EdgeKeys(edge_id)
         self._clock = clock
-        doctor = link_doctor()
-        doctor.check_id(settings, self._keys)
+        link_doctor().check_id(settings, self._keys)
         self._listener: EdgeListener | None = None
+        self._deaf = threading.Event()
         self._stack = ExitStack()
-        self._session = self._stack.enter_context(open_session(settings, failures=failures))
+        self._open()
+
+    def _open(self) -> None:
+        settings, self._deaf = self._settings, threading.Event()
+        opened = open_session(settings, failures=self._failures, on_deaf=self._deaf.set)
+        self._session = self._stack.enter_context(opened)
         self._loses = loses_declarations(settings, self._session)
         self._publishers = {
             channel: declare_publisher(self._session, channel, keys=self._keys) for channel in _PUBLISHED
         }
-        watch = doctor.watch(self._session, settings, served=lambda _ground: self.has_ground())
+        watch = link_doctor().watch(self._session, settings, served=lambda _ground: self.has_ground())
         self._watch = self._stack.enter_context(watch)
+        if self._listener is not None:
+            self._listener.go_on(self._session)
 
     @property
     def trouble(self) -> str:
@@ -121,15 +130,18 @@ class ZenohLink:
         return all(self.has_subscriber(channel) for channel in _NEEDED)
 
     def has_subscriber(self, channel: Channel) -> bool:
-        # Zenoh's own stub calls the status a bool.
-        return bool(self._publishers[channel].matching_status.matching)  # type: ignore[attr-defined]
+        status: Any = self._publishers[channel].matching_status  # Zenoh's own stub calls it a bool
+        return bool(status.matching)
 
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
         """Send one message; blocks while the link is full. A link that is gone drops it without an error."""
+        # A report goes about once a second.
+        if channel is Channel.STATUS and self._deaf.is_set():
+            self._stack.close()
+            self._open()
         with suppress(zenoh.ZError):
-            # A report goes about once a second.
             if channel is Channel.STATUS and self._listener is not None and self._loses():
                 self._listener.declare_again(there=self.has_ground())
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
@@ -138,12 +150,13 @@ class ZenohLink:
         self._listener = EdgeListener(
             self._session, self._keys, answers, failures=self._failures, clock=self._clock
         )
-        self._stack.callback(self._listener.close)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_error: object) -> None:
+        if self._listener is not None:
+            self._listener.close()
         self._stack.close()
 
 
@@ -166,6 +179,11 @@ class EdgeListener:
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
         self._version_said = False
+        self.go_on(self.session)
+
+    def go_on(self, session: zenoh.Session) -> None:
+        """Answer through this session from now on; nothing of another one is used any more."""
+        self.session = session
         self._used: set[Channel] = set()
         """Channels that the present ground has used."""
         self._waits: dict[Channel, RetryPause] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 import zlib
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_edge.link import publisher
+from programs.outsider import joined
 from programs.processes import eventually
 from rigs.messages import ANSWER, FEEDBACK, INFO_REQUEST, REQUEST
 
@@ -145,3 +147,32 @@ def test_who_wants_reports_alone_gets_them_over_udp(free_port):
         eventually(lambda: link.has_subscriber(Channel.STATUS))
         link.put(Channel.STATUS, b"x")
         eventually(lambda: came)
+
+
+def test_an_edge_whose_listener_hears_nothing_any_more_makes_its_link_anew(free_port, monkeypatch, caplog):
+    """No picture would come any more once its radio was plugged in anew: it had to be restarted by hand."""
+    there, answers = socket.if_nameindex(), iter([[]])
+    monkeypatch.setattr(socket, "if_nameindex", lambda: next(answers, there))
+    came, asked = [], []
+    told = publisher.Answers(
+        info=lambda _received_ns: b"yes", control=lambda _request: ANSWER, on_feedback=asked.append
+    )
+    with publisher.ZenohLink(
+        LinkSettings("edge", listen=(f"tcp/127.0.0.1:{free_port}#iface=lo",)),
+        edge_id="uav-1",
+        failures=Failures(time.time_ns),
+        clock=time.time_ns,
+    ) as link:
+        link.listen(told)
+        eventually(lambda: "since its interface was removed: the link is made anew" in caplog.text)
+        link.put(Channel.STATUS, b"x")
+        eventually(lambda: "listener: works again" in caplog.text)
+        with joined(f"tcp/127.0.0.1:{free_port}") as ground:
+            ground.declare_subscriber("hvt/uav-1/status", came.append)
+            eventually(lambda: link.has_subscriber(Channel.STATUS))
+            link.put(Channel.STATUS, b"x")
+            eventually(lambda: came)
+            ground.put("hvt/uav-1/feedback", FEEDBACK.pack())
+            eventually(lambda: asked)
+            (alive,) = ground.liveliness().get("hvt/uav-1/alive")
+            assert alive.ok is not None
