@@ -11,17 +11,15 @@ from rerun.chunk import Chunk
 
 from hvt_ground.sinks.palette import AMBER, GREY, SKY, VERMILLION, WHITE, class_colour, dimmed
 from hvt_ground.sinks.rerun.labels import LEGEND_POINTS, place_legend, points
-from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, REPORTED_MARK
+from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, LAYERS, REPORTED_MARK
 from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS
 from hvt_ground.sinks.rerun.tables import static_chunk
 
-VIDEO = "/base/video"
-TRACKS = "/base/tracks"
-REFINED = "/base/refined"
-REPORTED = "/base/reported"
-DOUBTED = "/base/doubted"
-LABELS = "/base/labels"
-LEGEND = "/base/legend"
+BASE = "/base/"
+"""With the name of a layer it is the place of its boxes."""
+VIDEO = BASE + "video"
+TRACKS, REPORTED, REFINED, DOUBTED, LABELS = (BASE + layer for layer in LAYERS)
+LEGEND = BASE + "legend"
 PATCHES = "/base/patches"
 STILLS = "/stills"
 OVERFLOW = "/stills/more"

@@ -17,7 +17,7 @@ from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.tables import MapPoints, TableRow, packed
 
 _EVERY_NS: Final = SECOND_NS
-_POINT_BYTES, _POSE_BYTES = 24, 90
+_POINT_BYTES = 24
 _PLAIN: Final = tuple(
     one.name for one in fields(Pose) if one.name not in ("capture_ns", "camera", "platform")
 )
@@ -30,10 +30,6 @@ class MapRows:
 
     def __init__(self) -> None:
         self._next_ns = 0
-
-    def pose(self, update: PoseUpdate) -> list[TableRow]:
-        """The camera's place, and all else that is known of it."""
-        return [TableRow(names.MAP_CAMERA, "pose", pose_numbers(update), _POSE_BYTES)]
 
     def overlay(self, overlay: Overlay) -> Iterable[TableRow]:
         """The places of tracks, at most once a second."""

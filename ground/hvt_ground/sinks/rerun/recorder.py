@@ -24,7 +24,7 @@ from hvt_ground.sinks.queued import SinkWriter, is_stored
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.blueprint import session_chunk, static_chunks
 from hvt_ground.sinks.rerun.live_view import LiveRecording
-from hvt_ground.sinks.rerun.map_rows import MapRows
+from hvt_ground.sinks.rerun.map_rows import MapRows, pose_numbers
 from hvt_ground.sinks.rerun.overlays import (
     BRIGHTNESS,
     LAYERS,
@@ -44,6 +44,7 @@ ON_DEMAND = "asked"
 """The reason of a still that somebody asked for: its track is chosen."""
 _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
+_POSE_BYTES = 90
 _BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
 """About the component's cost for a track; others cost little more than their row."""
 MOST_CLASSES = 256
@@ -52,13 +53,6 @@ thousands."""
 OTHER = "other"
 _MOMENTARY = ("video", "text", "lines", "jpeg", "message", "pose", "map points")
 """Tables whose values hold for one frame: a file that begins later does not begin with them."""
-_LAYER_PATHS: dict[Layer, str] = {
-    "tracks": names.TRACKS,
-    "reported": names.REPORTED,
-    "refined": names.REFINED,
-    "doubted": names.DOUBTED,
-    "labels": names.LABELS,
-}
 _NOTICES: dict[str, tuple[str, Rgb]] = {
     "info": ("INFO", GREY),
     "warning": ("WARN", AMBER),
@@ -271,7 +265,7 @@ class Recorder(SinkWriter[Event]):
         if not self._located:
             self._located = True
             self._into.show(self._screen(self._into.path))
-        return self._map.pose(update)
+        return [TableRow(names.MAP_CAMERA, "pose", pose_numbers(update), _POSE_BYTES)]
 
     def _sample(self, sample: VideoSample) -> list[TableRow]:
         if not sample.stored and not self._goes_on(sample):
@@ -312,7 +306,7 @@ class Recorder(SinkWriter[Event]):
         ]
 
     def _layer(self, update: LayerUpdate, *, at: tuple[int, int]) -> list[TableRow | Chunk]:
-        path = _LAYER_PATHS[update.layer]
+        path = names.BASE + update.layer
         rows: list[TableRow | Chunk] = []
         shape = "ellipses" if update.layer == "reported" else "boxes"
         for name, component in update.components.items():
@@ -344,9 +338,8 @@ class Recorder(SinkWriter[Event]):
         return self._class_ids.setdefault((known, level), len(self._class_ids))
 
     def _new_classes(self, layer: Layer) -> list[Chunk]:
-        return self._into.new_classes(
-            layer, _LAYER_PATHS[layer], self._class_ids, size=self._settings.base_size
-        )
+        size = self._settings.base_size
+        return self._into.new_classes(layer, names.BASE + layer, self._class_ids, size=size)
 
     def _refinement(self, refinement: Refinement) -> list[TableRow]:
         if refinement.reason == ON_DEMAND and refinement.track_id is not None:
