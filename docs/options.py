@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hvt_common.config import default_words
+from hvt_common.config import SWITCH, default_words
 from hvt_edge.config import EdgeConfig
 from hvt_ground.extras import config_class
 
@@ -61,7 +61,7 @@ def _row(field: dataclasses.Field[Any], config: type) -> str:
     default = default_words(config, field).replace("<", "&lt;")
     if default and " " not in default:
         default = f"`{default}`"
-    if field.metadata.get("switch"):
+    if field.metadata["kind"] is SWITCH:
         named = f"`--{key}`, `--no-{key}`{star}"
     else:
         named = (

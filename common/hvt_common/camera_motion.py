@@ -1,9 +1,7 @@
 """The camera's motion between two frames, and whether the second is of another scene, from the image alone."""
 
-from __future__ import annotations
-
 from collections import deque
-from typing import Final, cast
+from typing import Any, Final, cast
 
 import cv2
 import numpy as np
@@ -142,23 +140,21 @@ class CameraMotion:
         full_size = (image.shape[1], image.shape[0])
         scale = min(1.0, _WORKING_SIDE_PX / max(full_size)) if self._scale is None else self._scale
         small_size = (max(1, round(full_size[0] * scale)), max(1, round(full_size[1] * scale)))
-        half = (
-            max(1, full_size[0] // 2),
-            max(1, full_size[1] // 2),
-        )  # first: a third of the time of all at once
-        pixels = cv2.resize(image, half, interpolation=cv2.INTER_AREA) if 2 * scale <= 1 else image
-        gray = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        if 2 * scale <= 1:  # first to a half: a third of the time of all at once
+            half = max(1, full_size[0] // 2), max(1, full_size[1] // 2)
+            image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         self.gray = np.asarray(gray, np.uint8)
         current = np.asarray(cv2.resize(gray, small_size, interpolation=cv2.INTER_AREA), np.uint8)
         previous, self._previous = self._previous, current
         other = self._scene.take(current)
         self.new_scene = False
         if previous is None or previous.shape != current.shape:
-            return _identity()
+            return np.eye(2, 3)
         estimate = _by_flow(previous, current)
         self.new_scene = other and estimate is None
         if estimate is None or not _plausible(estimate):
-            return _identity()
+            return np.eye(2, 3)
         self._since = np.vstack((estimate, [0.0, 0.0, 1.0])) @ self._since
         return _at_full_size(estimate, full_size=full_size, small_size=small_size)
 
@@ -179,16 +175,12 @@ def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
     )
     if corners is None or len(corners) < _LEAST_INLIERS:
         return None
-    window = (_FLOW_WINDOW_PX, _FLOW_WINDOW_PX)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        previous,
-        current,
-        corners,
-        np.empty_like(corners),
-        winSize=window,
-        maxLevel=_FLOW_LEVELS,
-        criteria=_FLOW_UNTIL,
-    )
+    how: dict[str, Any] = {
+        "winSize": (_FLOW_WINDOW_PX,) * 2,
+        "maxLevel": _FLOW_LEVELS,
+        "criteria": _FLOW_UNTIL,
+    }
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(previous, current, corners, np.empty_like(corners), **how)
     tracked = found.ravel() == 1
     if np.count_nonzero(tracked) < _LEAST_INLIERS:
         return None
@@ -218,7 +210,3 @@ def _at_full_size(affine: Affine, *, full_size: tuple[int, int], small_size: tup
     offset = (ratio - 1) / 2
     linear = affine[:, :2] * ratio / ratio[:, None]
     return np.column_stack((linear, (affine[:, :2] @ offset + affine[:, 2] - offset) / ratio))
-
-
-def _identity() -> Affine:
-    return np.eye(2, 3)

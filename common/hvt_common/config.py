@@ -7,8 +7,6 @@ name settings in ``GONE`` that it does not take (any more): name → the end of 
 ``USUAL`` of a class: name → value that a start without flags has in place of the default, and the flags that undo it.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import difflib
@@ -18,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar
 
 import tomli_w
 
@@ -30,16 +28,13 @@ from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse
 _Config = TypeVar("_Config")
 
 
-class _Parse(Protocol):
-    def __call__(self, text: str, *, name: str) -> Any: ...
-
-
 @dataclass(frozen=True, slots=True)
 class SettingType:
     """Turns a setting's text into its value (`UserError` when it cannot), and the value into text."""
 
     metavar: str
-    parse: _Parse
+    parse: Callable[..., Any]
+    """``parse(text, name=…)``."""
     show: Callable[[Any], str | int | float] = str
 
 
@@ -128,6 +123,14 @@ def choice(*accepted: str, elsewhere: Mapping[str, str] | None = None) -> Settin
     return SettingType("|".join(accepted), parse)
 
 
+def _truth(given: object, *, name: str) -> bool:
+    if not isinstance(given, bool):
+        raise UserError(f"{name} {given!r} is not accepted: give true or false")
+    return given
+
+
+SWITCH = SettingType("", _truth, bool)
+"""Yes or no, which is no text anywhere."""
 AUTO = "auto"
 
 
@@ -165,16 +168,13 @@ class Group:
         With ``many`` the flag may be given several times and the value is a tuple; ``bare`` is the value of the
         flag alone.
         """
-        more = {"kind": kind, "many": many, "shown_default": shown_default, "bare": bare}
-        return self._field(default, help_line, more)
+        metadata = {"kind": kind, "many": many, "shown_default": shown_default, "bare": bare}
+        metadata |= {"help": help_line, "group": self.title, "rare": self.rare}
+        return dataclasses.field(default=default, metadata=metadata)
 
     def switch(self, help_line: str, *, default: bool = False) -> Any:
         """Declare a yes/no field: ``--name`` and ``--no-name``."""
-        return self._field(default, help_line, {"switch": True})
-
-    def _field(self, default: Any, help_line: str, more: Mapping[str, Any]) -> Any:
-        metadata = {"help": help_line, "group": self.title, "rare": self.rare, **more}
-        return dataclasses.field(default=default, metadata=metadata)
+        return self.option(SWITCH, default, help_line)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +194,10 @@ def load(
     Raises `UserError` for an unknown flag or key, a value that its kind does not take, or an unreadable file.
     """
     words = sys.argv[1:] if argv is None else argv
-    _refuse_gone(config_class, words)
+    for word in words:
+        if word.startswith("--"):
+            name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
+            _refuse_gone(config_class, name, said=f"--{name}")
     parser = _flags(config_class, program=program, description=description, rare="--help-all" in words)
     given = vars(parser.parse_args(words))
     print_config = bool(given.pop("print_config", False))
@@ -205,11 +208,11 @@ def load(
         values.update(_from_file(config_class, file))
     for field in dataclasses.fields(config_class):  # type: ignore[arg-type]
         if field.name in given:
-            values[field.name] = _value(field, given[field.name], name=_flag(field))
+            values[field.name] = _value(field, given[field.name], name=_flag(field.name))
     if file is not None:
         for name, value in values.items():
             if isinstance(value, Path | str):
-                check_not_read(Path(value), [file], name=f"--{name.replace('_', '-')}")
+                check_not_read(Path(value), [file], name=_flag(name))
     return config_class(**values), Loaded(values=values, print_config=print_config)
 
 
@@ -217,7 +220,7 @@ def settings_words(settings: Mapping[str, object]) -> list[str]:
     """Settings as a command line says them: ``{"edge_id": "a", "quiet": True}`` is ``--edge-id=a --quiet``."""
     words = []
     for name, value in settings.items():
-        flag = f"--{name.replace('_', '-')}"
+        flag = _flag(name)
         for one in value if isinstance(value, list | tuple) else [value]:
             if isinstance(one, bool):
                 words.append(flag if one else flag.replace("--", "--no-", 1))
@@ -226,15 +229,10 @@ def settings_words(settings: Mapping[str, object]) -> list[str]:
     return words
 
 
-def _gone(config_class: type) -> Mapping[str, str]:
-    return cast("Mapping[str, str]", getattr(config_class, "GONE", {}))
-
-
-def _refuse_gone(config_class: type, words: Sequence[str]) -> None:
-    for word in words:
-        name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
-        if word.startswith("--") and name in _gone(config_class):
-            raise UserError(f"--{name} {_gone(config_class)[name]}")
+def _refuse_gone(config_class: type, word: str, *, said: str) -> None:
+    gone: Mapping[str, str] = getattr(config_class, "GONE", {})
+    if word in gone:
+        raise UserError(f"{said} {gone[word]}")
 
 
 def to_toml(config: Any) -> str:
@@ -245,17 +243,15 @@ def to_toml(config: Any) -> str:
         if value is None or value == ():
             continue  # TOML has no null; a key that is absent means the same
         key = field.name.replace("_", "-")
-        if field.metadata.get("switch"):
-            table[key] = value
-        elif field.metadata["many"]:
+        if field.metadata["many"]:
             table[key] = [field.metadata["kind"].show(item) for item in value]
         else:
             table[key] = field.metadata["kind"].show(value)
     return tomli_w.dumps(table)
 
 
-def _flag(field: dataclasses.Field[Any]) -> str:
-    return "--" + field.name.replace("_", "-")
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _flags(config_class: type, *, program: str, description: str, rare: bool) -> argparse.ArgumentParser:
@@ -283,23 +279,13 @@ def _flags(config_class: type, *, program: str, description: str, rare: bool) ->
         hidden = field.metadata["rare"] and not rare
         shown = default_words(config_class, field).replace("%", "%%")
         shown_help = f"{help_line} [{shown}]" if shown else help_line
-        if field.metadata.get("switch"):
-            into.add_argument(
-                _flag(field),
-                action=argparse.BooleanOptionalAction,
-                help=argparse.SUPPRESS if hidden else shown_help,
-            )
-            continue
         kind: SettingType = field.metadata["kind"]
-        bare = field.metadata["bare"]
-        into.add_argument(
-            _flag(field),
-            metavar=kind.metavar,
-            action="append" if field.metadata["many"] else "store",
-            nargs="?" if bare else None,
-            const=bare or None,
-            help=argparse.SUPPRESS if hidden else shown_help,
-        )
+        bare, many = field.metadata["bare"], field.metadata["many"]
+        how: dict[str, Any] = {"action": argparse.BooleanOptionalAction}
+        if kind is not SWITCH:
+            how = {"action": "append" if many else "store", "metavar": kind.metavar}
+            how |= {"nargs": "?", "const": bare} if bare else {}
+        into.add_argument(_flag(field.name), help=argparse.SUPPRESS if hidden else shown_help, **how)
     return parser
 
 
@@ -314,20 +300,18 @@ def default_words(config_class: type, field: dataclasses.Field[Any]) -> str:
 def _shown(field: dataclasses.Field[Any], default: object) -> str:
     if default is None or default == ():
         return ""
-    if field.metadata.get("switch"):
-        return "yes" if default else "no"
     kind: SettingType = field.metadata["kind"]
+    if kind is SWITCH:
+        return "yes" if default else "no"
     if isinstance(default, tuple) and kind.metavar != SIZE.metavar and not kind.metavar.startswith("WxH"):
         return " ".join(str(kind.show(item)) for item in default)
     return str(kind.show(default))
 
 
 def _value(field: dataclasses.Field[Any], given: Any, *, name: str) -> Any:
-    if field.metadata.get("switch"):
-        if not isinstance(given, bool):
-            raise UserError(f"{name} {given!r} is not accepted: give true or false")
-        return given
     kind: SettingType = field.metadata["kind"]
+    if kind is SWITCH:
+        return kind.parse(given, name=name)
     if field.metadata["many"]:
         items = given if isinstance(given, list) else [given]
         return tuple(kind.parse(_one(item, name=name), name=name) for item in items)
@@ -353,17 +337,15 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
         raise UserError(f"--config {file} is not valid TOML: {error}") from None
     values: dict[str, Any] = {}
     for key, given in table.items():
-        field = fields.get(key.replace("_", "-"))
-        if key.replace("_", "-") in _gone(config_class):
-            raise UserError(f"{key} in {file} {_gone(config_class)[key.replace('_', '-')]}")
+        plain = key.replace("_", "-")
+        _refuse_gone(config_class, plain, said=f"{key} in {file}")
+        field = fields.get(plain)
         if field is None:
             near = difflib.get_close_matches(key.lower(), fields, n=1)
             hint = f"did you mean {near[0]}?" if near else "a key is an option without its two dashes"
             raise UserError(f"--config {file} has an unknown key {key!r}: {hint}")
         if field.name in values:
-            raise UserError(
-                f"--config {file} has {key.replace('_', '-')} twice, with - and with _: give it once"
-            )
+            raise UserError(f"--config {file} has {plain} twice, with - and with _: give it once")
         try:
             values[field.name] = _value(field, given, name=f"{key} in {file}")
         except UserError as error:  # the value may be an address that was meant for another key

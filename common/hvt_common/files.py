@@ -3,8 +3,6 @@
 A device that never ends is one that is too large to read.
 """
 
-from __future__ import annotations
-
 import codecs
 import errno
 import os

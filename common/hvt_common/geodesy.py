@@ -1,7 +1,5 @@
 """Places on the earth a few kilometres around, in metres, and the pose between two poses."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import TypeVar

@@ -5,8 +5,6 @@ stream key may stand in its user, its query, its path or its fragment, and may l
 with a typing error has them anywhere.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping

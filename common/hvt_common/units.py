@@ -1,9 +1,8 @@
 """Quantities as people write them (``800kbps``, ``2s``, ``1280x720``); each parser raises `UserError`."""
 
-from __future__ import annotations
-
 import math
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,10 +19,9 @@ _SIZE = re.compile(r"([0-9]{1,9})\s*[xX]\s*([0-9]{1,9})")
 _SPAN = re.compile(_NUMBER + r"\s*(s|min|h|days?|d|weeks?)")
 _AMOUNT = re.compile(_NUMBER + r"\s*(kB|MB|GB|TB)", re.IGNORECASE)
 _SPAN_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
-_AMOUNT_UNITS = {"k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12}
+_AMOUNT_UNITS = {"": 1, "b": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12}
 _BITRATE_UNITS = {"": 1, "b": 1, "k": 1_000, "m": 1_000_000}
-_BYTES_UNITS = {"": 1, "b": 1, "kb": 1_000, "mb": 1_000_000, "gb": 1_000_000_000}
-_DURATION_UNITS = {"": 1.0, "ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_DURATION_UNITS = {"": 1.0, "ms": 1e-3, "s": 1.0, "m": 60.0, "mi": 60.0, "h": 3600.0}
 _LIMIT_BPS = 1_000_000_000
 _LIMIT_BYTES = 10**12
 _LIMIT_S = 10_000_000.0
@@ -33,21 +31,23 @@ _LARGEST_BYTES = 10**15
 
 def parse_bitrate(text: str, *, name: str) -> int:
     """``800kbps`` → 800000 bits a second; a bare number is bits a second."""
-    match = _BITRATE.fullmatch(text.strip())
-    bps = 0.0
-    if match:
-        bps = float(match[1]) * _BITRATE_UNITS[(match[2] or "")[:1].lower()]
-    if not match or not 1 <= bps <= _LIMIT_BPS:
+    bps = _quantity(text, _BITRATE, _BITRATE_UNITS)
+    if not 1 <= bps <= _LIMIT_BPS:
         raise UserError(
             f"{name} {text!r} is not a bitrate: write 800kbps, 0.8Mbps or 800000 (bits a second), at most 1000Mbps"
         )
     return round(bps)
 
 
+def _quantity(text: str, pattern: re.Pattern[str], units: Mapping[str, float], *, letters: int = 1) -> float:
+    # NaN where it is none. The first letters of a unit tell it.
+    match = pattern.fullmatch(text.strip())
+    return float(match[1]) * units[(match[2] or "")[:letters].lower()] if match else math.nan
+
+
 def parse_bytes(text: str, *, name: str) -> int:
     """``200MB`` → 200000000 bytes; a bare number is bytes."""
-    match = _BYTES.fullmatch(text.strip())
-    size_bytes = float(match[1]) * _BYTES_UNITS[(match[2] or "").lower()] if match else math.nan
+    size_bytes = _quantity(text, _BYTES, _AMOUNT_UNITS)
     if not 0 <= size_bytes <= _LIMIT_BYTES:
         raise UserError(
             f"{name} {text!r} is not a number of bytes: write 200MB, 64kB or 1GB, at most 1000 GB"
@@ -57,8 +57,7 @@ def parse_bytes(text: str, *, name: str) -> int:
 
 def parse_duration_s(text: str, *, name: str) -> float:
     """``500ms`` → 0.5 seconds; a bare number is seconds."""
-    match = _DURATION.fullmatch(text.strip())
-    seconds = float(match[1]) * _DURATION_UNITS[match[2] or ""] if match else math.nan
+    seconds = _quantity(text, _DURATION, _DURATION_UNITS, letters=2)
     if not 0 <= seconds <= _LIMIT_S:
         raise UserError(
             f"{name} {text!r} is not a duration: write 2s, 500ms or 1min, at most {_LIMIT_S:.0f} s"
@@ -82,15 +81,11 @@ class Limit:
 
 def parse_limit(text: str, *, name: str) -> Limit:
     """``14days`` or ``200GB``; a bare number could be either and is neither."""
-    span, amount = _SPAN.fullmatch(text.strip()), _AMOUNT.fullmatch(text.strip())
-    if span:
-        seconds = float(span[1]) * _SPAN_UNITS[span[2][0]]
-        if 1 <= seconds <= _LONGEST_S:
-            return Limit(seconds=seconds)
-    elif amount:
-        size_bytes = float(amount[1]) * _AMOUNT_UNITS[amount[2][0].lower()]
-        if 1_000_000 <= size_bytes <= _LARGEST_BYTES:
-            return Limit(size_bytes=round(size_bytes))
+    seconds, size_bytes = _quantity(text, _SPAN, _SPAN_UNITS), _quantity(text, _AMOUNT, _AMOUNT_UNITS)
+    if 1 <= seconds <= _LONGEST_S:
+        return Limit(seconds=seconds)
+    if 1_000_000 <= size_bytes <= _LARGEST_BYTES:
+        return Limit(size_bytes=round(size_bytes))
     raise UserError(
         f"{name} {text!r} is neither a time nor a size: write 1h, 14days or 200GB, at least 1s or 1MB"
     )

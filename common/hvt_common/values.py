@@ -45,10 +45,7 @@ class View:
         """The map that centres the source in the base frame, whole (letterbox) or filling it (crop)."""
         ratios = (base_size[0] / source_size[0], base_size[1] / source_size[1])
         scale = min(ratios) if fit == "letterbox" else max(ratios)
-        offset = (
-            (base_size[0] - source_size[0] * scale) / 2,
-            (base_size[1] - source_size[1] * scale) / 2,
-        )
+        offset = ((base_size[0] - source_size[0] * scale) / 2, (base_size[1] - source_size[1] * scale) / 2)
         return cls(source_size=source_size, base_size=base_size, scale=scale, offset_px=offset)
 
     @property
@@ -189,17 +186,9 @@ class Tracks:
 
     @classmethod
     def none(cls, frame_index: int) -> Tracks:
-        none = np.empty(0, np.int64)
-        return cls(
-            frame_index=frame_index,
-            ids=none,
-            boxes_xyxy_px=np.empty((0, 4), np.float32),
-            confidences=np.empty(0, np.float32),
-            class_ids=np.empty(0, np.int32),
-            born_frames=none,
-            seen_frames=none,
-            started=np.empty(0, np.bool_),
-        )
+        none, found = np.empty(0, np.int64), Detections.none()
+        boxes, started = found.boxes_xyxy_px, np.empty(0, np.bool_)
+        return cls(frame_index, none, boxes, found.confidences, found.class_ids, none, none, started)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -230,11 +219,17 @@ def iou(
 
     ByteTrack measures boxes differently: see `tracking.association.overlaps`.
     """
-    a, b = np.asarray(a_xyxy_px, np.float64)[:, None, :], np.asarray(b_xyxy_px, np.float64)[None, :, :]
-    shared = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(
-        -1
-    )
-    areas_a = np.clip(a[..., 2:] - a[..., :2], 0, None).prod(-1)
-    areas_b = np.clip(b[..., 2:] - b[..., :2], 0, None).prod(-1)
-    union = areas_a + areas_b - shared
+    a, b = np.asarray(a_xyxy_px, np.float64), np.asarray(b_xyxy_px, np.float64)
+    areas = [np.clip(one[:, 2:] - one[:, :2], 0, None).prod(-1) for one in (a, b)]
+    shared = intersections(a, b)
+    union = np.add.outer(*areas) - shared
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0), np.float64)
+
+
+def intersections(
+    a_xyxy_px: npt.NDArray[np.floating[Any]], b_xyxy_px: npt.NDArray[np.floating[Any]]
+) -> npt.NDArray[Any]:
+    """The area that each of (N, 4) shares with each of (M, 4) boxes in one pixel space, (N, M)."""
+    a, b = a_xyxy_px[:, None, :], b_xyxy_px[None, :, :]
+    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
+    return np.asarray(np.clip(sides, 0, None).prod(-1))

@@ -9,8 +9,6 @@ A *group* is coarser: ``vehicle``, ``person``, ``boat``, ``animal`` (``names/gro
 of photographs can tell groups apart: ``names/imagenet_groups.txt`` has the group of each synset of ImageNet.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Sequence
 from importlib.resources import files

@@ -16,8 +16,6 @@ The crop is resized to the network's input as a whole, without keeping its shape
 crop 224" is meant for photographs; a crop around a box is already centred on its object and must not lose its ends.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Sequence
@@ -30,7 +28,7 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
-from hvt_common.inference.labels import class_labels, first_synonym, read_labels
+from hvt_common.inference.labels import class_labels, first_synonym, read_labels, unnamed
 from hvt_common.inference.letterbox import Preparation, as_bgr, prepared_as
 from hvt_common.inference.runtimes.first_steps import own_steps
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
@@ -240,12 +238,7 @@ def _class_names(
         _log.info("%s has no class names: its %d classes are taken for ImageNet's", model.path.name, classes)
         names = IMAGENET_NAMES
     if names is None:
-        _log.warning(
-            "%s has no class names: its classes are class 0 to class %d; --labels FILE names them",
-            model.path.name,
-            classes - 1,
-        )
-        return tuple(f"class {index}" for index in range(classes))
+        return unnamed(model.path, classes, "--labels FILE names them")
     fit = (len(names), classes)
     if fit == (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
         names = (_BACKGROUND, *names)

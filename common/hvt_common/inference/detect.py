@@ -1,7 +1,5 @@
 """Detectors: an ONNX network with one of the known heads, plain motion, or another package's."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Class names from a text file or a model's own metadata, and whether its scores are calibrated; opens no network."""
 
-from __future__ import annotations
-
 import ast
 import json
 import logging
@@ -112,9 +110,8 @@ def detector_labels(
     many inputs. Raises `UserError` where there are not as many as classes.
     """
     if names is None:
-        count = classes or _UNNAMED
-        _say_unnamed(path, count)
-        return tuple(f"class {index}" for index in range(count))
+        names_it = "--labels FILE (hvt-ground: --detector-labels FILE) names them; FILE may be "
+        return unnamed(path, classes or _UNNAMED, names_it + " or ".join(KNOWN_LABELS))
     if names is COCO_NAMES and said_by.startswith("labels"):
         by_head = _FIRST_COCO_ID.get(head) if inputs == 1 else None
         first = by_head if classes is None else _FIRST_COCO_ID_OF.get(classes)
@@ -137,14 +134,11 @@ def _coco_names_by_id() -> tuple[str, ...]:
 
 
 @cache  # once of a file: one that fails in flight is opened again and again
-def _say_unnamed(path: Path, count: int) -> None:
-    _log.warning(
-        "%s has no class names: its classes are class 0 to class %d; --labels FILE (hvt-ground: "
-        "--detector-labels FILE) names them; FILE may be %s",
-        path.name,
-        count - 1,
-        " or ".join(KNOWN_LABELS),
-    )
+def unnamed(path: Path, count: int, how: str) -> tuple[str, ...]:
+    """Numbers for names of a model that has none, which is said, with ``how`` to name its classes."""
+    said = "%s has no class names: its classes are class 0 to class %d; %s"
+    _log.warning(said, path.name, count - 1, how)
+    return tuple(f"class {index}" for index in range(count))
 
 
 def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:

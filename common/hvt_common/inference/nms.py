@@ -4,8 +4,6 @@ OpenCV's C++ loop does the work: on 2000 boxes of 500 objects it takes 4 ms wher
 a full IoU matrix 23, and it selects the same boxes in the same order.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import numpy.typing as npt

@@ -1,7 +1,5 @@
 """Models whose run may raise: a flight goes on without them, and they are opened again with growing pauses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Generic, Protocol, TypeVar, cast

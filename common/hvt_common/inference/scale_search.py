@@ -8,8 +8,6 @@ searched reduced too, or each one while it shows a large object: a network overl
 docs/embedded-models.md.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable

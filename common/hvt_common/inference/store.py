@@ -4,8 +4,6 @@ The embedded models come with the package: trained in this repository, Apache-2.
 library is an extra: the entry points of the group ``hvt.models``.
 """
 
-from __future__ import annotations
-
 import difflib
 import os
 from collections.abc import Collection, Sequence

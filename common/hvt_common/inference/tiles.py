@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.nms import MAX_DETECTIONS, components, suppress
-from hvt_common.values import Boxes, Detections, Image
+from hvt_common.values import Boxes, Detections, Image, intersections
 
 if TYPE_CHECKING:
     from hvt_common.inference.detect import Detector
@@ -145,9 +145,8 @@ def detect_whole(detector: Detector, image_bgr: Image, *, share: float = 1.0) ->
     A network whose input may have any size gets one with a ``share`` of its sides.
     """
     one = detector.whole if isinstance(detector, TiledDetector) else detector
-    return (
-        one.detect(image_bgr, share=share) if share < 1 and isinstance(one, _Sized) else one.detect(image_bgr)
-    )
+    sized = share < 1 and isinstance(one, _Sized)
+    return one.detect(image_bgr, share=share) if sized else one.detect(image_bgr)  # type: ignore[call-arg]
 
 
 class TiledDetector:
@@ -225,18 +224,11 @@ def are_large(boxes: Boxes, image_bgr: Image) -> npt.NDArray[np.bool_]:
 
 def _truncated(boxes: Boxes, tile: Tile, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
     # (N,) True for boxes that touch a border of the tile that is not one of the picture.
-    x1, y1, x2, y2 = tile
-    margin_x, margin_y = (max(1.0, _BORDER_SHARE * side) for side in (x2 - x1, y2 - y1))
-    truncated = np.zeros(len(boxes), bool)
-    if x1 > 0:
-        truncated |= boxes[:, 0] < x1 + margin_x
-    if y1 > 0:
-        truncated |= boxes[:, 1] < y1 + margin_y
-    if x2 < size[0]:
-        truncated |= boxes[:, 2] > x2 - margin_x
-    if y2 < size[1]:
-        truncated |= boxes[:, 3] > y2 - margin_y
-    return truncated
+    low, high = np.array(tile, np.float32).reshape(2, 2)
+    margin = np.maximum(1.0, _BORDER_SHARE * (high - low))
+    before = (boxes[:, :2] < low + margin) & (low > 0)
+    behind = (boxes[:, 2:] > high - margin) & (high < size)
+    return np.asarray((before | behind).any(axis=1))
 
 
 def _merged(parts: list[Detections], truncated: npt.NDArray[np.bool_]) -> Detections:
@@ -299,12 +291,8 @@ def _first_come(same: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
 
 def shared_of_smaller(a_xyxy: Boxes, b_xyxy: Boxes) -> npt.NDArray[np.float32]:
     """(N, M) intersection over the smaller of two boxes."""
-    a, b = a_xyxy[:, None, :], b_xyxy[None, :, :]
-    shared = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(
-        -1
-    )
-    smaller = np.minimum(areas(a), areas(b))
-    return np.asarray(shared / np.maximum(smaller, 1e-6), np.float32)
+    smaller = np.minimum.outer(areas(a_xyxy), areas(b_xyxy))
+    return np.asarray(intersections(a_xyxy, b_xyxy) / np.maximum(smaller, 1e-6), np.float32)
 
 
 def areas(boxes: Boxes) -> npt.NDArray[np.float32]:

@@ -5,8 +5,6 @@ the view is unlike the training pictures, most boxes are weak. Of ten measures i
 (docs/embedded-models.md). It costs no run.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import deque

@@ -4,8 +4,6 @@ Keys are ``hvt/<edge>/<channel>``; those of a group of grounds are ``hvt-group/<
 knows strings only; `session` turns the names into Zenoh's own values.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The offset of a remote clock, from the four times of a request and its answer; times of a camera by ours. Pure."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 `Status`, JSON and metrics have the words of the code.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

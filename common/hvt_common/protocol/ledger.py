@@ -44,14 +44,8 @@ _REPLY_BYTES = 36
 """More than a put: the numbers of query and replier, and the message that ends the query. Measured likewise."""
 STANDARD_ENCODINGS = frozenset(
     {
-        "application/octet-stream",
-        "application/cbor",
-        "application/json",
-        "image/jpeg",
-        "image/png",
-        "image/webp",
-        "video/h264",
-        "video/h265",
+        *("application/octet-stream", "application/cbor", "application/json"),
+        *("image/jpeg", "image/png", "image/webp", "video/h264", "video/h265"),
     }
 )
 _BATCH_BYTES = 16384
@@ -63,12 +57,7 @@ _SEGMENT_HEADER_BYTES = 52
 
 
 def overhead_bytes(
-    payload_bytes: int,
-    attachment_bytes: int,
-    *,
-    key: str,
-    encoding: str = "",
-    reply: bool = False,
+    payload_bytes: int, attachment_bytes: int, *, key: str, encoding: str = "", reply: bool = False
 ) -> int:
     """Bytes that one Zenoh message over TCP and IPv4 takes on the line beyond its payload and attachment.
 

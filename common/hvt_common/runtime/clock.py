@@ -1,7 +1,5 @@
 """The clock of a process, Unix time that never steps; how much time has passed, whatever the wall clock says."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable
@@ -30,10 +28,7 @@ class SteadyClock:
     """
 
     def __init__(
-        self,
-        *,
-        wall_ns: Callable[[], int] = time.time_ns,
-        monotonic_ns: Callable[[], int] = since_boot_ns,
+        self, *, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = since_boot_ns
     ) -> None:
         self._wall_ns = wall_ns
         self._monotonic_ns = monotonic_ns

@@ -299,12 +299,7 @@ class Awaited(Generic[_Part]):
     """
 
     def __init__(
-        self,
-        open_part: Callable[[], _Part],
-        name: str,
-        failures: Failures,
-        *,
-        longest_s: float = 5.0,
+        self, open_part: Callable[[], _Part], name: str, failures: Failures, *, longest_s: float = 5.0
     ) -> None:
         self._open_part = open_part
         self._name = name

@@ -4,8 +4,6 @@ A site may have its own name lead to an address of this machine (DNS rebinding):
 a server answers, and command. So a server answers only to names that no stranger can have.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import re
 import socket

@@ -1,7 +1,5 @@
 """Parts that other packages install behind an entry point: found by name, loaded when named, never a traceback."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import cache

@@ -5,8 +5,6 @@ Priorities, as Linux's niceness: 0 for moving pictures, 11 for perception with i
 Also the messages to systemd.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

@@ -1,7 +1,5 @@
 """The report of a run: a status line, at its end a table and a JSON file; and the findings of a check before it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """Statistics in bounded memory, however long a run is: percentiles of a latency, sets of numbers, newest entries."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections import OrderedDict

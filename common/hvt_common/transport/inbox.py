@@ -3,8 +3,6 @@
 A flood is far more messages of one kind than a working peer sends. Its watch takes time as an argument.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Hashable

@@ -33,7 +33,8 @@ class Rights:
     def of(cls, config: zenoh.Config) -> Rights:
         """From a configuration that Zenoh has accepted."""
         said = json.loads(config.get_json("access_control")) or {}
-        subjects = {one["id"]: _names(one) for one in said.get("subjects") or ()}
+        named = {one["id"]: one.get("cert_common_names") for one in said.get("subjects") or ()}
+        subjects = {one: None if names is None else frozenset(names) for one, names in named.items()}
         granted = tuple(
             (subjects.get(subject, frozenset()), tuple(policy["rules"]))
             for policy in said.get("policies") or ()
@@ -82,11 +83,6 @@ class Rights:
             for rule in rules
             if rule in self.rules
         ]
-
-
-def _names(subject: Mapping[str, Any]) -> frozenset[str] | None:
-    names = subject.get("cert_common_names")
-    return None if names is None else frozenset(names)
 
 
 _GROUP = "hvt.link"

@@ -4,8 +4,6 @@ Peers connect to named endpoints only: no multicast, no gossip, no shared memory
 loopback by default. Callbacks of Zenoh never block: they copy into an `Inbox`, which has a bound.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import re
@@ -38,10 +36,7 @@ _MAY_COME = re.compile(
 
 @contextmanager
 def open_session(
-    settings: LinkSettings,
-    *,
-    failures: Failures | None = None,
-    on_deaf: Callable[[], None] | None = None,
+    settings: LinkSettings, *, failures: Failures | None = None, on_deaf: Callable[[], None] | None = None
 ) -> Iterator[zenoh.Session]:
     """A running session; closed within a second on the way out, whatever state the link is in.
 
@@ -147,38 +142,23 @@ def subscribe(
     """
 
     def receive(sample: zenoh.Sample) -> None:
-        try:
-            take(sample)
-        except Exception as error:
-            if on_error is None:
-                raise
-            on_error(str(sample.key_expr), error)
-
-    def take(sample: zenoh.Sample) -> None:
         received_ns = clock()
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        put(
-            Received(
-                key=str(sample.key_expr),
-                payload=sample.payload.to_bytes(),
-                attachment=attachment,
-                encoding=str(sample.encoding),
-                received_ns=received_ns,
-            )
-        )
+        key, attachment = str(sample.key_expr), sample.attachment
+        extra = b"" if attachment is None else attachment.to_bytes()
+        try:
+            put(Received(key, sample.payload.to_bytes(), extra, str(sample.encoding), received_ns))
+        except Exception as error:
+            if on_error is None:
+                raise
+            on_error(key, error)
 
     return session.declare_subscriber(key_expr, receive)
 
 
 def query(
-    session: zenoh.Session,
-    channel: Channel,
-    *,
-    keys: EdgeKeys,
-    question: bytes,
-    timeout_s: float,
+    session: zenoh.Session, channel: Channel, *, keys: EdgeKeys, question: bytes, timeout_s: float
 ) -> bytes | None:
     """The first answer of a queryable channel; None when there is none in time, after ``timeout_s``.
 

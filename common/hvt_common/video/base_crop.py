@@ -35,11 +35,7 @@ def coded_size(
 
 
 def base_crop(
-    picture: Picture,
-    *,
-    view: View,
-    crop_source_px: tuple[int, int, int, int],
-    size: tuple[int, int],
+    picture: Picture, *, view: View, crop_source_px: tuple[int, int, int, int], size: tuple[int, int]
 ) -> Image:
     """The base frame's view of a crop, resampled to ``size``: the picture that a still must beat.
 

@@ -3,8 +3,6 @@
 Also the NAL units in an Annex B byte stream (ITU-T H.264 and H.265, annex B).
 """
 
-from __future__ import annotations
-
 import re
 from threading import Lock
 from typing import cast

@@ -138,11 +138,7 @@ STRIDES: tuple[tuple[int, ...], ...] = (
     *((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32)),
     *((4, 8, 16), (8, 16)),  # for small objects alone
 )
-YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (
-    *STRIDES[:2],
-    (8, 16, 32, 12, 24, 48),
-    (8, 16, 32, 16, 32, 64),
-)
+YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (*STRIDES[:2], (8, 16, 32, 12, 24, 48), (8, 16, 32, 16, 32, 64))
 LEAST_COLUMNS = 5
 BGR_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=False)
 

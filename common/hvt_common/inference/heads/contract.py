@@ -4,8 +4,6 @@ No form trusts a number: boxes that are not finite, have no area, no probability
 is here, as the embedded detector writes it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol

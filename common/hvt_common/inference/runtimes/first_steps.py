@@ -1,7 +1,5 @@
 """Whether a network scales its pixels itself or turns their colours round, read from its file: ONNX or OpenVINO's."""
 
-from __future__ import annotations
-
 import mmap
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.letterbox import OwnSteps
-from hvt_common.inference.runtimes.model_file import GRAPH_FIELD, fields_of, files_of, is_ir
+from hvt_common.inference.runtimes.model_file import GRAPH_FIELD, fields_of, files_of, is_ir, text
 
 # Field numbers of onnx.proto.
 _NODE, _INITIALIZER, _INPUT = 1, 5, 11
@@ -156,7 +154,8 @@ def _graph(
             name, value = _tensor(data, begin, stop)
             constants[name] = value
         elif number == _INPUT:
-            inputs.append(_text(data, begin, stop, 1))
+            names = (text(data[span[3] : span[4]]) for span in fields_of(data, begin, stop) if span[0] == 1)
+            inputs.append(next(names, ""))
     return next((name for name in inputs if name not in constants), ""), users, constants
 
 
@@ -164,11 +163,11 @@ def _node(data: mmap.mmap, start: int, end: int) -> _Node:
     node = _Node()
     for number, _, _, begin, stop in fields_of(data, start, end):
         if number == _NODE_INPUT:
-            node.inputs.append(data[begin:stop].decode(errors="replace"))
+            node.inputs.append(text(data[begin:stop]))
         elif number == _NODE_OUTPUT:
-            node.output = data[begin:stop].decode(errors="replace")
+            node.output = text(data[begin:stop])
         elif number == _NODE_KIND:
-            node.kind = data[begin:stop].decode(errors="replace")
+            node.kind = text(data[begin:stop])
         elif number == _NODE_ATTRIBUTE:
             for inner, wire_type, _, first, last in fields_of(data, begin, stop):
                 if inner == _ATTRIBUTE_TENSOR and wire_type == 2:
@@ -181,7 +180,7 @@ def _tensor(data: mmap.mmap, start: int, end: int) -> tuple[str, _Numbers | None
     name, kind, value = "", 0, None
     for number, wire_type, said, begin, stop in fields_of(data, start, end):
         if number == _TENSOR_NAME:
-            name = data[begin:stop].decode(errors="replace")
+            name = text(data[begin:stop])
         elif number == _TENSOR_TYPE:
             kind = said
         elif number in (_TENSOR_FLOATS, _TENSOR_RAW) and wire_type == 2 and stop - begin <= _MOST_BYTES:
@@ -189,8 +188,3 @@ def _tensor(data: mmap.mmap, start: int, end: int) -> tuple[str, _Numbers | None
     dtype = np.dtype(_TYPES.get(kind, "<f4"))
     known = value is not None and kind in _TYPES and len(value) % dtype.itemsize == 0
     return name, np.frombuffer(value, dtype).astype(np.float64) if known and value else None
-
-
-def _text(data: mmap.mmap, start: int, end: int, wanted: int) -> str:
-    spans = (span[3:] for span in fields_of(data, start, end) if span[0] == wanted)
-    return next((data[begin:stop].decode(errors="replace") for begin, stop in spans), "")

@@ -228,9 +228,7 @@ def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
     choice = ProviderChoice("openvino", why, explicit=True)
     _check_ports(path, inputs, outputs)
     _log.info("%s runs on openvino: %s", path.name, why)
-    return OnnxModel(
-        path, inputs=inputs, outputs=outputs, metadata=metadata, runner=openvino, provider=choice
-    )
+    return OnnxModel(path, inputs, outputs, metadata=metadata, runner=openvino, provider=choice)
 
 
 def _quicker(openvino: OnnxModel, path: Path, settings: ModelSettings) -> OnnxModel:
@@ -261,32 +259,26 @@ def _seconds(model: OnnxModel, feed: npt.NDArray[Any]) -> Iterator[float]:
 
 
 def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxModel:
+    runner: _Runner
     if choice.provider == "openvino":
-        described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
+        session = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()
-        bf16 = found is not None and found.bf16
-        openvino = _on_openvino(path, settings, bf16=bf16)
-        return _described(path, described, openvino, choice)
-    names = ONNXRUNTIME_PROVIDERS[choice.provider]
-    session = _session(path, settings, names)
-    if session.get_providers()[0] != names[0]:
-        raise UserError(
-            f"--provider {choice.provider} did not start (its driver or libraries are missing): choose cpu"
-        )
-    return _described(path, session, _OnnxRuntimeRunner(path, session), choice)
+        runner = _on_openvino(path, settings, bf16=found is not None and found.bf16)
+    else:
+        names = ONNXRUNTIME_PROVIDERS[choice.provider]
+        session = _session(path, settings, names)
+        if session.get_providers()[0] != names[0]:
+            raise UserError(
+                f"--provider {choice.provider} did not start (its driver or libraries are missing): choose cpu"
+            )
+        runner = _OnnxRuntimeRunner(path, session)
+    inputs, outputs = _ports(session)
+    metadata = session.get_modelmeta().custom_metadata_map
+    return OnnxModel(path, inputs, outputs, metadata=metadata, runner=runner, provider=choice)
 
 
-def _described(
-    path: Path, session: ort.InferenceSession, runner: _Runner, choice: ProviderChoice
-) -> OnnxModel:
-    return OnnxModel(
-        path,
-        inputs=tuple(map(_port, session.get_inputs())),
-        outputs=tuple(map(_port, session.get_outputs())),
-        metadata=session.get_modelmeta().custom_metadata_map,
-        runner=runner,
-        provider=choice,
-    )
+def _ports(session: ort.InferenceSession) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
+    return tuple(map(_port, session.get_inputs())), tuple(map(_port, session.get_outputs()))
 
 
 def _session(
@@ -322,7 +314,7 @@ def _session(
                 f"model {path} has {value.name!r:.40}, a {value.type:.80}; tensors are accepted: export it without"
                 " ZipMap, or without lists"
             )
-    _check_ports(path, tuple(map(_port, session.get_inputs())), tuple(map(_port, session.get_outputs())))
+    _check_ports(path, *_ports(session))
     return session
 
 

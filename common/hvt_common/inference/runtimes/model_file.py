@@ -5,8 +5,6 @@ its weights: external weights make a runtime open files by the names that stand 
 even for a model given as bytes, relative to the working folder).
 """
 
-from __future__ import annotations
-
 import functools
 import mmap
 import os
@@ -86,7 +84,9 @@ def check_onnx_file(path: Path) -> None:
 
 def opset_versions(path: Path) -> dict[str, int]:
     """The version of each operator set that a checked model imports, by domain; "" is ONNX itself."""
-    return dict(_opset(data) for field, _, data in _top_fields(path) if field == _OPSET_FIELD)
+    # An OperatorSetIdProto: domain is field 1, version field 2.
+    sets = (_entry(data) for field, _, data in _top_fields(path) if field == _OPSET_FIELD)
+    return {text(one.get(1, (0, b""))[1]): one.get(2, (0, b""))[0] for one in sets}
 
 
 def onnx_version(path: Path) -> tuple[int, str]:
@@ -96,14 +96,16 @@ def onnx_version(path: Path) -> tuple[int, str]:
         if field == _VERSION_FIELD:
             version = value
         elif field in (_PRODUCER_FIELD, _PRODUCER_VERSION_FIELD):
-            producer = f"{producer} {data[:80].decode(errors='replace')}".strip()
+            producer = f"{producer} {text(data[:80])}".strip()
     return version, producer
 
 
 def onnx_metadata(path: Path) -> dict[str, str]:
     """The metadata that the exporter wrote into a model. Raises `UserError` as `check_onnx_file` does."""
     check_onnx_file(path)
-    return dict(_metadata_entry(data) for field, _, data in _top_fields(path) if field == _METADATA_FIELD)
+    # A StringStringEntryProto: key is field 1, value field 2.
+    said = (_entry(data) for field, _, data in _top_fields(path) if field == _METADATA_FIELD)
+    return {text(one.get(1, (0, b""))[1]): text(one.get(2, (0, b""))[1]) for one in said}
 
 
 def _top_fields(path: Path) -> Iterator[tuple[int, int, bytes]]:
@@ -174,28 +176,20 @@ def _tensor_location(data: _Bytes, start: int, end: int) -> str | None:
             external = value == _EXTERNAL
         elif field == _TENSOR_EXTERNAL_DATA and wire_type == 2:
             external = True
-            entry = {number: data[a:b] for number, _, _, a, b in fields_of(data, begin, stop)}
-            if entry.get(1) == b"location":
-                location = entry.get(2, b"")[:200].decode(errors="replace")
+            entry = _entry(data[begin:stop])
+            if entry.get(1, (0, b""))[1] == b"location":
+                location = text(entry.get(2, (0, b""))[1][:200])
     return location if external else None
 
 
-def _opset(data: bytes) -> tuple[str, int]:
-    # Decode an OperatorSetIdProto: domain is field 1, version field 2.
-    domain, version = "", 0
-    for field, _, value, begin, end in fields_of(data, 0, len(data)):
-        if field == 1:
-            domain = data[begin:end].decode(errors="replace")
-        elif field == 2:
-            version = value
-    return domain, version
+def _entry(data: bytes) -> dict[int, tuple[int, bytes]]:
+    # Value (of a varint) and bytes of each field of a small message, by number.
+    return {field: (value, data[a:b]) for field, _, value, a, b in fields_of(data, 0, len(data))}
 
 
-def _metadata_entry(data: bytes) -> tuple[str, str]:
-    # Decode a StringStringEntryProto: key is field 1, value field 2.
-    entry = {field: data[begin:end] for field, _, _, begin, end in fields_of(data, 0, len(data))}
-    key, value = (entry.get(field, b"").decode(errors="replace") for field in (1, 2))
-    return key, value
+def text(data: bytes) -> str:
+    """Text of a model, which may be anything."""
+    return data.decode(errors="replace")
 
 
 def fields_of(data: _Bytes, start: int, end: int) -> Iterator[tuple[int, int, int, int, int]]:

@@ -5,8 +5,6 @@ An entry point of the group ``hvt.detectors`` is a callable that gives a detecto
 the text, say the file of a model. The package is imported when it is named. Its answers are checked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from importlib.metadata import EntryPoint
 from typing import Any

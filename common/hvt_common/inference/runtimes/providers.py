@@ -15,8 +15,6 @@ OpenVINO takes 150 MB itself; the processor computes in bf16, without which it i
 (measured); and this network is measured to be quicker with it. Else cpu.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 

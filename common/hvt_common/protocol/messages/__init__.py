@@ -3,8 +3,6 @@
 Who makes vectors of them reaches into `envelope`, `fields`, `bits`, `range_coder` and `track_boxes`.
 """
 
-from __future__ import annotations
-
 from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.protocol.messages.backlog import (
     MAX_ACKNOWLEDGED_RANGES,

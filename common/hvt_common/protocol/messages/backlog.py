@@ -5,8 +5,6 @@ chunks, in order, as the budget allows; the ground acknowledges ranges in `Feedb
 or a second outage costs no more than the chunk in flight.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Messages of the ground: info and control requests with their answers, and the receiver report."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum

@@ -4,8 +4,6 @@
 `Kind.decode` takes a value from MessagePack and raises `WireError`: the other side sent a bad message.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from abc import ABC, abstractmethod
@@ -292,12 +290,7 @@ class ListOf(Kind):
         return tuple(self.inner.decode(item) for item in raw)
 
     def schema(self) -> dict[str, Any]:
-        return {
-            "type": "array",
-            "least": self.least,
-            "most": self.max_items,
-            "of": self.inner.schema(),
-        }
+        return {"type": "array", "least": self.least, "most": self.max_items, "of": self.inner.schema()}
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,11 +75,7 @@ class _Number:
         return value
 
 
-_ANGLES: Final = (
-    _Number(0, 3599, 3, wraps=True),
-    _Number(-900, 900, 3),
-    _Number(-1800, 1799, 3, wraps=True),
-)
+_ANGLES: Final = (_Number(0, 3599, 3, wraps=True), _Number(-900, 900, 3), _Number(-1800, 1799, 3, wraps=True))
 _PLACE: Final = (_Number(-900_000_000, 900_000_000, 5), _Number(-1_800_000_000, 1_799_999_999, 5, wraps=True))
 _HEIGHT, _ALTITUDE = _Number(-10_000, 1_000_000, 2), _Number(-10_000, 1_000_000, 2)
 _FIELD: Final = _Number(1, 1799, 0)

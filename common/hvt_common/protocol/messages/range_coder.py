@@ -6,8 +6,6 @@ Binary decisions are coded with the probability that a `Context` has learned for
 decoder takes no notice of it and returns the one it reads. So a syntax is written down once for both.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Reports of the edge: `Info` as answer to a query, `Status` once a second."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ in fours. Velocities count 1/4096 of a pixel a frame.
 The syntax is written once (`_Walk`), for writer and reader alike: see `range_coder`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median_low

@@ -10,8 +10,6 @@ A step is coded against the one before it (``reference``), or by itself (-1) abo
 message hurts no longer than that. How the boxes are coded stands in `track_boxes`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 

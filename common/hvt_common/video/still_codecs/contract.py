@@ -9,8 +9,6 @@ that a setting (``--jpeg-quality 65``), a floor and a ceiling keep their meaning
 has a ladder from it to its own measure: the mean Y-PSNR of 26 crops of drone_carpark, linear between the rows.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
@@ -88,16 +86,8 @@ class StillCodec(Protocol):
 
 
 _QP = (
-    (1, 50),
-    (5, 46.5),
-    (20, 37),
-    (35, 33.4),
-    (50, 31.2),
-    (65, 29),
-    (80, 25.4),
-    (90, 21.2),
-    (97, 14),
-    (100, 10),
+    *((1, 50), (5, 46.5), (20, 37), (35, 33.4), (50, 31.2)),
+    *((65, 29), (80, 25.4), (90, 21.2), (97, 14), (100, 10)),
 )
 """(quality in percent, QP of H.264)."""
 

@@ -1,7 +1,5 @@
 """`h264-intra`: one intra slice of x264, whose headers both sides know."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 

@@ -6,8 +6,6 @@ fields that slice data depends on are fixed here and checked at the edge (`cabac
 others that x264 writes (level, timing).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from hvt_common.protocol.messages.bits import BitReader, BitWriter, escaped, unescaped

@@ -1,7 +1,5 @@
 """Baseline JPEG: the paper's still."""
 
-from __future__ import annotations
-
 import re
 
 import cv2

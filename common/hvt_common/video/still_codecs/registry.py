@@ -5,8 +5,6 @@ satisfies `contract.StillCodec`, or is called without arguments to give one. A t
 its codec is requested by name, so that a broken plug-in matters only where it is used.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Mapping

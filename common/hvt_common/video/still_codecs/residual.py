@@ -10,8 +10,6 @@ to the bit. All of it is arithmetic of whole numbers (docs/wire-stills.md). A ch
 anything is painted.
 """
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

@@ -6,8 +6,6 @@ order, only that more quality is no worse and nearly always more bytes; the retu
 bytes or reaches the PSNR in any case.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

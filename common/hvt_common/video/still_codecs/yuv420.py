@@ -5,8 +5,6 @@ picture here is one uint8 array as FFmpeg lays out ``yuv420p``: (3/2 H, W), luma
 multiples of `BLOCK_PX`; samples beyond the crop repeat its last row and column.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2
