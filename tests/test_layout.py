@@ -1,13 +1,10 @@
 """The tree stays one that a stranger finds his way in."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess
 import tomllib
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 import pytest
@@ -21,7 +18,7 @@ FLIES = PACKAGES[:3]
 MOST_AT_THE_TOP, MOST_IN_A_FOLDER = 8, 14
 
 
-def modules() -> list[PurePosixPath]:
+def modules():
     """Every Python file that git has; the tests' too."""
     listed = subprocess.run(
         ["git", "ls-files", "*.py"], cwd=ROOT, capture_output=True, text=True, check=False
@@ -84,7 +81,7 @@ def test_a_room_names_what_is_there():
     assert gone == set()
 
 
-def imported(path: PurePosixPath) -> Iterator[str]:
+def imported(path):
     """Dotted names of all that a file imports, inside functions too; of a name it may be one too many."""
     for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:

@@ -1,7 +1,5 @@
 """No test sets a private name of the product: what a test has to set is a parameter. SLF001 sees to the rest."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

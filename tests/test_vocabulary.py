@@ -1,12 +1,9 @@
 """One word for one thing, and the word that the field already uses."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess
 import tokenize
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -41,7 +38,7 @@ _OPTIONS = frozenset({"follow", "keep", "keep_video"})
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z0-9]+")
 
 
-def _tracked(*patterns: str) -> list[str]:
+def _tracked(*patterns):
     listed = subprocess.run(
         ["git", "ls-files", *patterns], cwd=ROOT, capture_output=True, text=True, check=False
     )
@@ -51,14 +48,14 @@ def _tracked(*patterns: str) -> list[str]:
     return [one for one in listed.stdout.split() if one not in left_out and "imagenet" not in one]
 
 
-def _forbidden(name: str) -> bool:
+def _forbidden(name):
     if name in _LIBRARIES_SAY | _OPTIONS:
         return False
     parts = {part.lower() for part in _PARTS.findall(name)}
     return bool(parts & _NO_NAME) or name.strip("_") in _NO_CLASS
 
 
-def _names(file: str) -> Iterator[tuple[int, str]]:
+def _names(file):
     with (ROOT / file).open("rb") as source:
         for token in tokenize.tokenize(source.readline):
             if token.type == tokenize.NAME and not token.string.startswith("test_"):
@@ -77,7 +74,7 @@ def test_words_that_went_stay_away():
     assert not found, f"{len(found)} words that shared terms replace:\n" + "\n".join(found)
 
 
-def _prose(file: str) -> Iterator[str]:
+def _prose(file):
     # Docstrings, also those behind constants and fields, and comments.
     source = (ROOT / file).read_text(encoding="utf-8")
     yield from (match[0] for match in re.finditer(r"(^|  )# .*", source, re.MULTILINE))

@@ -1,7 +1,5 @@
 """What people write is refused in a sentence, also where the system does not even let it be looked at."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal
@@ -48,10 +46,9 @@ def test_a_disk_that_does_not_answer_may_come_back_and_a_closed_folder_does_not(
     assert type(caught.value) is kind
 
 
-@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOBUFS])
-def test_what_is_used_up_may_be_free_again(number):
-    """A page that waits for its port while descriptors are used up would never come."""
-    assert may_come(OSError(number, "no"))
+def test_what_is_used_up_may_be_free_again():
+    """A camera or a port would be given up for a moment without descriptors."""
+    assert all(may_come(OSError(number, "no")) for number in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS))
 
 
 def test_a_command_checks_its_files_too():
@@ -103,34 +100,25 @@ def test_a_file_without_an_end_is_refused(read):
     assert "larger than 16 MB" in str(raised.value) or "not a file" in str(raised.value)
 
 
-def test_a_pipe_that_nobody_writes_into_is_read_no_further(monkeypatch, tmp_path):
-    """The start stood still, and neither Ctrl-C nor a service manager ended it but by force."""
+def test_a_pipe_is_read_to_its_end_and_where_nobody_writes_no_further(monkeypatch, tmp_path):
+    """The start would hang, deaf to Ctrl-C; or ``--config <(…)`` be half of what it says."""
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "wb") as writer:
+        writer.write(b"edge-id")
+    assert read_text(Path(f"/proc/self/fd/{reading}")) == "edge-id"
+    os.close(reading)
     monkeypatch.setattr(files, "PIPE_WAIT_S", 0.0)
     os.mkfifo(pipe := tmp_path / "pipe")
     with pytest.raises(OSError, match="into which nobody writes"):
         read_text(pipe)
 
 
-def test_a_pipe_is_read_to_its_end():
-    """``--config <(…)`` brings settings that no disk shall hold."""
-    reading, writing = os.pipe()
-    with os.fdopen(writing, "wb") as writer:
-        writer.write(b"edge-id")
-    assert read_text(Path(f"/proc/self/fd/{reading}")) == "edge-id"
-    os.close(reading)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_text_is_read_as_its_byte_order_mark_says(encoding, tmp_path):
-    """Notepad's files began with a strange character, or were no text at all."""
+def test_text_is_read_as_its_byte_order_mark_says(tmp_path):
+    """A file that an editor of another system has saved would be refused, or read as other letters."""
     file = tmp_path / "file.txt"
-    file.write_text("Straße", encoding=encoding)
-    assert read_text(file) == label_text(file) == "Straße"
-
-
-def test_bytes_that_are_no_text_are_an_error_of_the_file(tmp_path):
-    """Its callers say in one sentence what they expect instead."""
-    file = tmp_path / "file.txt"
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        file.write_text("Straße", encoding=encoding)
+        assert read_text(file) == label_text(file) == "Straße"
     file.write_bytes(b"car\xff")
     with pytest.raises(OSError, match="not UTF-8 text at byte 3"):
         read_text(file)
@@ -206,42 +194,33 @@ def test_output_for_which_there_is_no_room_is_a_sentence(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "code", "said"),
     [
-        MemoryError(),
-        RuntimeError("can't start new thread"),
-        OSError(errno.EMFILE, "Too many open files"),
-        ImportError("/lib/zenoh.so: failed to map segment from shared object"),
+        *(
+            (error, 1, "the system gives it no more memory, threads or files (")
+            for error in (
+                MemoryError(),
+                RuntimeError("can't start new thread"),
+                OSError(errno.EMFILE, "Too many open files"),
+                ImportError("/lib/zenoh.so: failed to map segment from shared object"),
+            )
+        ),
+        (
+            UserError(f"--size {'9' * 5000!r} and a\nb\udcff are not accepted: give é"),
+            2,
+            f"--size {repr('9' * 5000)[:300]}… and a\\nb\\udcff are not accepted: give é\n",
+        ),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (KeyboardInterrupt(signal.SIGTERM), 143, "interrupted\n"),
     ],
 )
-def test_where_the_system_gives_no_more_that_is_a_sentence(error, capsys):
-    """A start under `ulimit -v`, `-u` or `-n` ended in a traceback."""
+def test_what_ends_a_program_is_a_sentence_in_a_line(error, code, said, capsys):
+    """The user would read a traceback, a screen of nines, or nothing."""
 
     def run(_argv):
         raise error
 
-    assert exit_with_sentence(run, program="it", argv=[]) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("it: the system gives it no more memory, threads or files (")
-
-
-def test_a_value_with_line_ends_or_without_an_end_is_told_in_a_line(capsys):
-    """A log would have half of the sentence, or a screen of nines."""
-
-    def refuse(_argv):
-        raise UserError(f"--size {'9' * 5000!r} and a\nb\udcff are not accepted: give é")
-
-    assert exit_with_sentence(refuse, program="it", argv=[]) == 2
-    told = capsys.readouterr().err
-    assert told == f"it: --size {repr('9' * 5000)[:300]}… and a\\nb\\udcff are not accepted: give é\n"
-
-
-@pytest.mark.parametrize(("said", "code"), [((), 130), ((signal.SIGTERM,), 143)])
-def test_an_interruption_is_a_sentence(said, code, capsys):
-    """Ctrl-C while a ground starts, or in the middle of an export, showed forty lines of a traceback."""
-
-    def run(_argv):
-        raise KeyboardInterrupt(*said)
-
     assert exit_with_sentence(run, program="it", argv=[]) == code
-    assert capsys.readouterr().err == "it: interrupted\n"
+    told = capsys.readouterr().err
+    assert told.startswith(f"it: {said}")
+    assert told.count("\n") == 1

@@ -1,16 +1,13 @@
 """Files that are written: whether a name still leads to one."""
 
-from __future__ import annotations
-
 import subprocess
-from pathlib import Path
 
 import pytest
 
 from hvt_common.files import check_there
 
 
-def test_one_on_a_disk_that_was_unmounted_is_noticed(tmp_path: Path) -> None:
+def test_one_on_a_disk_that_was_unmounted_is_noticed(tmp_path):
     """A flight was recorded for hours where nobody could read it, and the report called it 0.00 MB."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -24,7 +21,7 @@ def test_one_on_a_disk_that_was_unmounted_is_noticed(tmp_path: Path) -> None:
             check_there(file.fileno(), path)
 
 
-def test_one_that_was_moved_is_there(tmp_path: Path) -> None:
+def test_one_that_was_moved_is_there(tmp_path):
     """To move a flight that is written, or its folder, ended its recording."""
     path = tmp_path / "now" / "flight.rrd"
     path.parent.mkdir()

@@ -1,11 +1,8 @@
 """What the command lines import before they know what to do."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
-
 import pytest
+
+from programs.processes import python
 
 HEAVY = {
     *("av", "onnxruntime", "zenoh", "rich", "rerun", "filelock", "json5", "openvino"),
@@ -25,5 +22,5 @@ HEAVY = {
 def test_a_command_line_imports_what_its_settings_need_and_no_more(asked, heavy):
     """``--help``, a wrong setting and a script that asks for the status would take a second of a small board."""
     code = f"import sys; {asked}; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    done = python(code)
     assert heavy & set(done.stdout.split()) == set()

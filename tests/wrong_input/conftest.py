@@ -1,9 +1,6 @@
 """What every wrong input must come to: one sentence, exit code 2, and nothing left behind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,17 +16,17 @@ _PROGRAMS = {"hvt-edge": hvt_edge.cli.main, "hvt-ground": hvt_ground.cli.main}
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path, monkeypatch):
     """An empty working folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 @pytest.fixture
-def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Refused:
+def refused(here, capfd):
     """Run a program in this process with wrong settings; return the sentence it refuses them with."""
 
-    def refused(program: str, *settings: str, code: int = 2) -> str:
+    def refused(program, *settings, code=2):
         before = snapshot(here)
         assert _PROGRAMS[program]([*settings, "--quiet"]) == code
         out, err = capfd.readouterr()
@@ -40,7 +37,7 @@ def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Refused:
 
 
 @pytest.fixture
-def pictures(here: Path) -> str:
+def pictures(here):
     """A folder that is a good source: two small pictures."""
     folder = here / "pictures"
     folder.mkdir()

@@ -1,7 +1,5 @@
 """hvt-ground with input that it cannot use."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 
@@ -17,21 +15,17 @@ from media.onnx_models import colour_classifier
 def ground(refused, free_port):
     """Refuse settings on top of a run that would otherwise work, and end by itself."""
 
-    def ground(*settings: str, code: int = 2) -> str:
+    def ground(*settings, code=2):
         listen = () if "--listen" in settings else ("--listen", f"tcp/127.0.0.1:{free_port}")
         return refused("hvt-ground", *listen, "--once", "--wait", "1s", *settings, code=code)
 
     return ground
 
 
-def test_a_failed_start_leaves_nothing_behind(ground):
-    """A second ground would look as if it worked, and the files of the first would be touched."""
+def test_a_failed_start_leaves_nothing_behind_and_an_old_recording_as_it_was(ground, here):
+    """The next start would number its files on, or yesterday's flight be lost."""
     for record in ("flight.rrd", "recordings"):
         ground("--listen", "tcp/0.0.0.0:7999", "--record", record, "--summary", "s.json")
-
-
-def test_a_failed_start_leaves_an_old_recording_as_it_was(ground, here):
-    """The flight of yesterday would be gone."""
     Path("flight.rrd").write_bytes(b"yesterday")
     ground("--listen", "tcp/0.0.0.0:7999", "--record", "flight.rrd")
     assert Path("flight.rrd").read_bytes() == b"yesterday"
@@ -139,19 +133,18 @@ def test_a_classifier_with_no_class_in_common(ground, tmp_path):
     assert "apple, pear, plum; tracks are car, van" in sentence
 
 
-def test_types_without_anybody_to_tell_and_types_that_are_none(ground):
-    """Every object would be something else than the user said."""
+def test_types_without_anybody_to_tell_and_types_that_are_none(ground, monkeypatch):
+    """Symbols would be those of the defaults, and nobody know why; a certificate be missed at the first message."""
     Path("types.toml").write_text('[classes]\ncar = "a vehicle"\n', encoding="utf-8")
-    assert "give --cot too" in ground("--cot-types", "types.toml")
-    url = ("--cot", "udp://127.0.0.1:9")
-    assert "car = 'a vehicle' is no Cursor on Target type" in ground(*url, "--cot-types", "types.toml")
-    assert "cannot be read" in ground(*url, "--cot-types", "nowhere.toml")
-
-
-def test_a_server_that_wants_a_certificate_that_is_not_there(ground, monkeypatch):
-    """It would be noticed in the air."""
     monkeypatch.delenv("PYTAK_TLS_CLIENT_CERT", raising=False)
-    assert "PYTAK_TLS_CLIENT_CERT" in ground("--cot", "tls://127.0.0.1:8089")
+    udp = ("--cot", "udp://127.0.0.1:9", "--cot-types")
+    for words, says in (
+        (("--cot-types", "types.toml"), "give --cot too"),
+        ((*udp, "types.toml"), "car = 'a vehicle' is no Cursor on Target type"),
+        ((*udp, "nowhere.toml"), "cannot be read"),
+        (("--cot", "tls://127.0.0.1:8089"), "PYTAK_TLS_CLIENT_CERT"),
+    ):
+        assert says in ground(*words)
 
 
 @pytest.mark.parametrize("flag", ["--summary", "--timing", "--log", "--tracks", "--mcap", "--ts", "--record"])

@@ -1,7 +1,5 @@
 """Models and labels that are not what their flag wants, on both sides."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,7 @@ def program(refused, pictures, free_port):
         "hvt-ground": ["--listen", f"tcp/127.0.0.1:{free_port}", "--once", "--wait", "60s"],
     }
 
-    def program(name: str, *settings: str) -> str:
+    def program(name, *settings):
         return refused(name, *common[name], *settings)
 
     return program
@@ -39,16 +37,12 @@ def test_labels_that_do_not_fit(program, here, name, model, labels):
     assert "two.txt has 2 class names" in program(name, f"--{model}", str(file), f"--{labels}", "two.txt")
 
 
-def test_labels_without_a_classifier(program, here):
-    """The names would silently not count."""
+def test_a_classifier_or_labels_that_need_another_setting(program, here):
+    """Names would be taken and never used; stills be judged by a detector that is not there."""
     Path("names.txt").write_text("car\n")
     sentence = program("hvt-ground", "--labels", "names.txt")
     assert "--labels names.txt names a classifier's classes" in sentence
     assert "--classifier" in sentence
-
-
-def test_redetection_without_a_detector(program):
-    """No track would ever be refined."""
     sentence = program("hvt-ground", "--detector", "motion", "--classifier", "detector")
     assert "--classifier detector" in sentence
     assert "--detector" in sentence

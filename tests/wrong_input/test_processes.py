@@ -1,7 +1,5 @@
 """The same as processes of their own: what a shell and a service manager see."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -13,10 +11,11 @@ from programs.refusal import checked, snapshot
 pytestmark = pytest.mark.integration
 
 
-def started(module: str, *words: str, folder) -> subprocess.CompletedProcess[str]:
-    """Run a program to its end."""
+def started(folder, module, *words):
+    """Run a program to its end: its exit code, and what it says."""
     command = [sys.executable, "-m", module, *words]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -29,22 +28,21 @@ def started(module: str, *words: str, folder) -> subprocess.CompletedProcess[str
 def test_one_sentence_and_exit_code_2(here, module, words, told):
     """A script could not tell a mistake in its settings from a crash."""
     before = snapshot(here)
-    done = started(module, *words, folder=here)
-    assert done.returncode == 2
-    assert done.stdout == ""
+    code, out, err = started(here, module, *words)
+    assert (code, out) == (2, "")
     program = "hvt-" + module.removeprefix("hvt_").removesuffix(".cli")
-    assert told in checked(done.stderr, program=program, left=snapshot(here) - before)
+    assert told in checked(err, program=program, left=snapshot(here) - before)
 
 
-@pytest.mark.parametrize("module", ["hvt_models.command", "hvt_study.cli"])
-def test_every_program_says_its_version(here, module):
-    """Who reports a fault would be told that a command is required."""
-    assert started(module, "--version", folder=here).stdout.endswith(f" {__version__}\n")
-
-
-def test_help_is_not_an_error(here):
-    """Who asks for help would be told off."""
-    done = started("hvt_ground.cli", "--help", folder=here)
-    assert done.returncode == 0
-    assert done.stderr == ""
-    assert "--summary" in done.stdout
+@pytest.mark.parametrize(
+    ("module", "asked", "said"),
+    [
+        *((one, "--version", f" {__version__}\n") for one in ("hvt_models.command", "hvt_study.cli")),
+        ("hvt_ground.cli", "--help", "--summary"),
+    ],
+)
+def test_version_and_help_are_no_error(here, module, asked, said):
+    """Who reports a fault would be told that a command is required, and who asks for help be told off."""
+    code, out, err = started(here, module, asked)
+    assert (code, err) == (0, "")
+    assert said in out

@@ -1,7 +1,5 @@
 """A command of an earlier version is answered with what to write today."""
 
-from __future__ import annotations
-
 import hvt_study.cli
 
 

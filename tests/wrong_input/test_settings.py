@@ -1,7 +1,5 @@
 """Each setting of both programs, as a flag and in a file, with values of a wrong kind."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

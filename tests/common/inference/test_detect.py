@@ -1,10 +1,6 @@
 """Detectors: heads, letterbox, suppression, names, and the real models."""
 
-from __future__ import annotations
-
 import tracemalloc
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -33,9 +29,10 @@ from media.onnx_models import (
 )
 
 RGB = str({0: "red", 1: "green", 2: "blue"})
+OURS = {"hvt.training_commit": "1a2b3c4"}
 
 
-def iou(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def iou(first, second):
     """(N, M) overlaps, written apart from the code under test."""
     result = np.zeros((len(first), len(second)))
     for i, a in enumerate(np.asarray(first, float)):
@@ -47,85 +44,75 @@ def iou(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return result
 
 
-def empty(rows: int, columns: int) -> np.ndarray:
+def empty(rows, columns):
     """An output in which nothing was found."""
     return np.zeros((1, rows, columns), np.float32)
+
+
+def dense(columns):
+    """What an Ultralytics network of two classes answers: these columns, and nothing in the others."""
+    table = empty(4 + 2, 84)
+    for place, column in columns.items():
+        table[0, :, place] = column
+    return table
+
+
+def answering(folder, table, *, metadata=None, **settings):
+    """A detector whose network answers each picture with the table."""
+    return open_detector(str(constant_model(folder / "m.onnx", table, metadata=metadata)), **settings)
+
+
+def found_in(folder, table, **settings):
+    """What such a detector finds."""
+    return answering(folder, table, **settings).detect(np.zeros((64, 64, 3), np.uint8))
 
 
 # --- heads ---------------------------------------------------------------------------------------------------------
 
 
-def test_yolox_boxes_come_out_exactly(tmp_path: Path) -> None:
-    """Every box of the most permissive detector family would be somewhere else."""
-    table = empty(84, 5 + 3)
-    grid = cells((64, 64))
+def test_yolox_boxes_come_out_exactly(tmp_path):
+    """Every box of the most permissive detector family would be somewhere else; decoded twice, as large as all."""
+    raw, decoded, grid = empty(84, 5 + 3), empty(84, 6), cells((64, 64))
     row = int(np.flatnonzero((grid == (2, 1, 16)).all(axis=1))[0])
-    table[0, row] = [0.25, 0.5, np.log(2), np.log(1.5), 0.8, 0.1, 0.9, 0.2]
-    detector = open_detector(str(constant_model(tmp_path / "m.onnx", table)), confidence=0.5)
-    found = detector.detect(np.zeros((64, 64, 3), np.uint8))
+    raw[0, row] = [0.25, 0.5, np.log(2), np.log(1.5), 0.8, 0.1, 0.9, 0.2]
+    detector = answering(tmp_path, raw, confidence=0.5)
     assert detector.class_names == ("class 0", "class 1", "class 2")
+    found = detector.detect(np.zeros((64, 64, 3), np.uint8))
     assert found.class_ids.tolist() == [1]
     np.testing.assert_allclose(found.confidences, [0.72], rtol=1e-5)
     np.testing.assert_allclose(found.boxes_xyxy_px, [[36 - 16, 24 - 12, 36 + 16, 24 + 12]], rtol=1e-5)
-
-
-def test_a_yolox_export_that_is_decoded_already_is_told_apart(tmp_path: Path) -> None:
-    """Decoding twice would blow every box up to the whole image."""
-    grid = cells((64, 64))
-    table = empty(84, 6)
-    table[0, :, :2] = (grid[:, :2] + 0.5) * grid[:, 2:]
-    table[0, :, 2:4] = 10
-    table[0, 20, :6] = [30, 20, 12, 8, 0.9, 1.0]
-    path = constant_model(tmp_path / "m.onnx", table, metadata={"names": "['boat']"})
-    found = open_detector(str(path)).detect(np.zeros((64, 64, 3), np.uint8))
+    decoded[0, :, :2] = (grid[:, :2] + 0.5) * grid[:, 2:]
+    decoded[0, :, 2:4] = 10
+    decoded[0, 20, :6] = [30, 20, 12, 8, 0.9, 1.0]
+    found = found_in(tmp_path, decoded, metadata={"names": "['boat']"})
     np.testing.assert_allclose(found.boxes_xyxy_px, [[24, 16, 36, 24]], rtol=1e-5)
 
 
-def test_ultralytics_boxes_come_out_exactly_and_suppressed_by_class(tmp_path: Path) -> None:
-    """One car would count as five, or a person before a car would vanish."""
-    table = empty(4 + 2, 84)
-    table[0, :, 3] = [30, 20, 20, 10, 0.3, 0.7]
-    table[0, :, 9] = [34, 20, 20, 10, 0.0, 0.8]
-    table[0, :, 60] = [30, 20, 20, 10, 0.9, 0.1]
-    table[0, :, 70] = [50, 50, 10, 10, 0.1, 0.26]
-    table[0, :, 71] = [50, 20, 10, 10, 0.1, 0.24]
-    found = open_detector(str(constant_model(tmp_path / "m.onnx", table))).detect(
-        np.zeros((64, 64, 3), np.uint8)
+def test_ultralytics_boxes_come_out_exactly_and_suppressed_by_class(tmp_path):
+    """One car would count as five, a person before a car vanish, or a van be a car and a van in every list."""
+    several = {3: [30, 20, 20, 10, 0.3, 0.7], 9: [34, 20, 20, 10, 0, 0.8], 60: [30, 20, 20, 10, 0.9, 0.1]}
+    found = found_in(
+        tmp_path, dense(several | {70: [50, 50, 10, 10, 0.1, 0.26], 71: [50, 20, 10, 10, 0.1, 0.24]})
     )
     np.testing.assert_allclose(found.confidences, [0.9, 0.8, 0.26], rtol=1e-5)
     assert found.class_ids.tolist() == [0, 1, 1]
     np.testing.assert_allclose(found.boxes_xyxy_px, [[20, 15, 40, 25], [24, 15, 44, 25], [45, 45, 55, 55]])
+    twice = dense({3: [30, 20, 20, 10, 0.7, 0.0], 9: [31, 20, 20, 10, 0.0, 0.8]})
+    assert found_in(tmp_path, twice).class_ids.tolist() == [1]
 
 
-def test_two_names_of_one_vehicle_are_one_detection(tmp_path: Path) -> None:
-    """Each van would be two tracks, a car and a van, in every list and every count."""
-    table = empty(4 + 2, 84)
-    table[0, :, 3] = [30, 20, 20, 10, 0.7, 0.0]
-    table[0, :, 9] = [31, 20, 20, 10, 0.0, 0.8]
-    found = open_detector(str(constant_model(tmp_path / "m.onnx", table))).detect(
-        np.zeros((64, 64, 3), np.uint8)
-    )
-    assert found.class_ids.tolist() == [1]
-
-
-def test_end_to_end_boxes_come_out_exactly(tmp_path: Path) -> None:
+def test_end_to_end_boxes_come_out_exactly(tmp_path):
     """The newest YOLO models could not be used."""
     table = empty(20, 6)
-    table[0, 2] = [5, 6, 30, 40, 0.6, 2]
-    table[0, 7] = [5, 6, 31, 40, 0.9, 1]
-    table[0, 8] = [5, 6, 31, 40, 0.2, 1]
-    path = constant_model(tmp_path / "m.onnx", table, metadata={"names": RGB})
-    detector = open_detector(str(path))
+    table[0, [2, 7, 8]] = [[5, 6, 30, 40, 0.6, 2], [5, 6, 31, 40, 0.9, 1], [5, 6, 31, 40, 0.2, 1]]
+    detector = answering(tmp_path, table, metadata={"names": RGB})
     found = detector.detect(np.zeros((64, 64, 3), np.uint8))
     assert [detector.class_names[i] for i in found.class_ids] == ["green", "blue"]
     np.testing.assert_allclose(found.boxes_xyxy_px, [[5, 6, 31, 40], [5, 6, 30, 40]])
-    assert open_detector(str(constant_model(tmp_path / "n.onnx", table))).class_names[:2] == (
-        "class 0",
-        "class 1",
-    )
+    assert answering(tmp_path, table).class_names[:2] == ("class 0", "class 1")
 
 
-def test_broken_numbers_never_become_detections(tmp_path: Path) -> None:
+def test_broken_numbers_never_become_detections(tmp_path):
     """One NaN would poison the tracker for the rest of the flight."""
     head = YoloxCells(STRIDES)
     bad = empty(84, 6)
@@ -154,7 +141,7 @@ def test_broken_numbers_never_become_detections(tmp_path: Path) -> None:
     assert len(Listed(0, 4, 5)([rows], confidence=0.25, input_size=(64, 64)).scores) == 0
 
 
-def test_a_picture_that_gives_no_number_is_none_without_objects(tmp_path: Path) -> None:
+def test_a_picture_that_gives_no_number_is_none_without_objects(tmp_path):
     """Half precision overflows on some pictures: the ground would say that nothing is there."""
     path = colour_detector(tmp_path / "m.onnx", "ultralytics", size=(96, 64))
     detector = open_detector(str(scaling_inside(path, [("Mul", -1), ("Add", 0.97), ("Sqrt", None)])))
@@ -168,7 +155,7 @@ def test_a_picture_that_gives_no_number_is_none_without_objects(tmp_path: Path) 
 
 @pytest.mark.parametrize("head", ["yolox", "ultralytics"])
 @pytest.mark.parametrize("shape", [(48, 128), (200, 64), (96, 96), (311, 517), (31, 64)])
-def test_a_coloured_square_is_found_where_it_is(tmp_path: Path, head: str, shape: tuple[int, int]) -> None:
+def test_a_coloured_square_is_found_where_it_is(tmp_path, head, shape):
     """Boxes would be shifted or stretched on every image that is not square, or red and blue swapped."""
     size = (96, 64)
     path = colour_detector(tmp_path / "m.onnx", head, size=size)
@@ -209,7 +196,7 @@ def test_a_picture_that_fits_is_not_copied_whole():
     assert held < tensor.nbytes + picture.nbytes / 2
 
 
-def test_a_thermal_palette_is_shown_in_grey() -> None:
+def test_a_thermal_palette_is_shown_in_grey():
     """Under "iron" hardly a person was found, for .65 of them in the same pictures in grey."""
     rng = np.random.default_rng(5)
     heat = cv2.GaussianBlur(rng.integers(0, 256, (240, 320), np.uint8), (0, 0), 6)
@@ -229,7 +216,7 @@ def test_a_thermal_palette_is_shown_in_grey() -> None:
         assert is_grey == (image is grey)
 
 
-def test_the_border_is_grey_114() -> None:
+def test_the_border_is_grey_114():
     """Networks would see an edge around every picture that they were not trained on."""
     preparation = Preparation(mean=(0.0,) * 3, scale=(1 / 255,) * 3)
     boxer = Letterboxer(anchor="centre", preparation=preparation, dtype=np.dtype(np.float32))
@@ -243,35 +230,26 @@ def test_the_border_is_grey_114() -> None:
 
 
 @given(
-    width=st.integers(1, 5000),
-    height=st.integers(1, 5000),
-    cells_x=st.integers(1, 40),
-    cells_y=st.integers(1, 40),
+    image=st.tuples(st.integers(1, 5000), st.integers(1, 5000)),
+    tiles=st.tuples(st.integers(1, 40), st.integers(1, 40)),
     anchor=st.sampled_from(["top-left", "centre"]),
 )
-def test_the_letterbox_holds_the_image_and_maps_back(
-    width: int, height: int, cells_x: int, cells_y: int, anchor: Any
-) -> None:
+def test_the_letterbox_holds_the_image_and_maps_back(image, tiles, anchor):
     """A panorama or a sliver would crash the detector or lose its boxes."""
-    size = (cells_x * 32, cells_y * 32)
-    letterbox = Letterbox.fitted((width, height), size, anchor=anchor)
+    size = (tiles[0] * 32, tiles[1] * 32)
+    letterbox = Letterbox.fitted(image, size, anchor=anchor)
     left, top, w, h = letterbox.content
-    assert min(left, top) >= 0
-    assert w >= 1
-    assert h >= 1
-    assert left + w <= size[0]
-    assert top + h <= size[1]
+    assert 0 <= left < left + w <= size[0]
+    assert 0 <= top < top + h <= size[1]
     whole = letterbox.to_image(np.array([[left, top, left + w, top + h], [-9e9, -9e9, 9e9, 9e9]], np.float32))
-    np.testing.assert_allclose(whole, [[0, 0, width, height]] * 2, rtol=1e-5)
+    np.testing.assert_allclose(whole, [[0, 0, *image]] * 2, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
     "shape", [(1, 1, 3), (1, 1), (7, 500, 3), (500, 3, 3), (40, 40), (40, 40, 1), (40, 40, 4)]
 )
 @pytest.mark.parametrize("size", [(64, 64), None])
-def test_odd_images_do_not_crash(
-    tmp_path: Path, shape: tuple[int, ...], size: tuple[int, int] | None
-) -> None:
+def test_odd_images_do_not_crash(tmp_path, shape, size):
     """A thermal camera, or a broken frame, would end the process."""
     detector = open_detector(str(colour_detector(tmp_path / "m.onnx", "yolox", size=size)), confidence=0.45)
     found = detector.detect(np.full(shape, 255, np.uint8))
@@ -281,7 +259,7 @@ def test_odd_images_do_not_crash(
     assert (np.diff(found.confidences) <= 0).all()
 
 
-def test_what_is_no_image_is_a_bug() -> None:
+def test_what_is_no_image_is_a_bug():
     """An empty crop would be stretched into a phantom."""
     for shape, kind in (((0, 4, 3), np.uint8), ((4, 4, 3), np.float32), ((4, 4, 2), np.uint8)):
         with pytest.raises(ValueError, match="image"):
@@ -291,7 +269,7 @@ def test_what_is_no_image_is_a_bug() -> None:
 # --- suppression ---------------------------------------------------------------------------------------------------
 
 
-def plain_suppression(boxes: np.ndarray, scores: np.ndarray, classes: np.ndarray, limit: float) -> list[int]:
+def plain_suppression(boxes, scores, classes, limit):
     """Greedy suppression, word for word."""
     kept: list[int] = []
     for i in sorted(range(len(scores)), key=lambda i: (-scores[i], i)):
@@ -303,7 +281,7 @@ def plain_suppression(boxes: np.ndarray, scores: np.ndarray, classes: np.ndarray
 
 
 @given(seed=st.integers(0, 10_000), count=st.integers(0, 40))
-def test_suppression_keeps_what_the_definition_keeps(seed: int, count: int) -> None:
+def test_suppression_keeps_what_the_definition_keeps(seed, count):
     """Neighbouring cars would hide each other, or one car be seen twice."""
     rng = np.random.default_rng(seed)
     centres, sides = rng.uniform(0, 60, (count, 2)), rng.uniform(5, 40, (count, 2))
@@ -315,29 +293,35 @@ def test_suppression_keeps_what_the_definition_keeps(seed: int, count: int) -> N
     assert suppress(boxes, scores, classes, iou=0.45, limit=2).tolist() == kept[:2]
 
 
-def test_a_box_of_our_networks_is_the_mean_of_what_several_cells_say(tmp_path: Path) -> None:
-    """Boxes would jump where one cell after the other is the surest, and stand half beside small cars."""
-    table = empty(4 + 2, 84)
-    table[0, :, 3] = [30, 20, 20, 10, 0.8, 0.0]
-    table[0, :, 9] = [32, 21, 20, 10, 0.4, 0.0]
-    table[0, :, 10] = [36, 20, 20, 10, 0.7, 0.0]  # it is suppressed, and shares too little to be heard
-    table[0, :, 11] = [30, 22, 20, 10, 0.0, 0.6]  # another kind of object
+def test_a_box_of_our_networks_is_the_mean_of_what_several_cells_say(tmp_path):
+    """Boxes would jump where one cell after the other is the surest, and stand half beside small cars.
+
+    Neighbours that both stay have boxes of their own.
+    """
+    table = dense(
+        {
+            3: [30, 20, 20, 10, 0.8, 0.0],
+            9: [32, 21, 20, 10, 0.4, 0.0],
+            10: [36, 20, 20, 10, 0.7, 0.0],  # it is suppressed, and shares too little to be heard
+            11: [30, 22, 20, 10, 0.0, 0.6],  # another kind of object
+        }
+    )
     mean = np.array([20, 15, 40, 25]) + np.array([2, 1, 2, 1]) * 0.4 / 1.2
-    for metadata, first in (({"hvt.training_commit": "1a2b3c4"}, mean), ({}, np.array([20, 15, 40, 25]))):
-        path = constant_model(tmp_path / "m.onnx", table, metadata=metadata)
-        found = open_detector(str(path)).detect(np.zeros((64, 64, 3), np.uint8))
-        expected = np.stack([first, [20, 17, 40, 27]])
-        np.testing.assert_allclose(found.boxes_xyxy_px, expected, rtol=1e-5)
+    for metadata, first in ((OURS, mean), ({}, np.floor(mean))):
+        found = found_in(tmp_path, table, metadata=metadata)
+        np.testing.assert_allclose(found.boxes_xyxy_px, np.stack([first, [20, 17, 40, 27]]), rtol=1e-5)
         np.testing.assert_allclose(found.confidences, [0.8, 0.6], rtol=1e-5)
+    two = dense({3: [30, 20, 20, 10, 0.8, 0.0], 9: [34.5, 20, 20, 10, 0.7, 0.0]})
+    found = found_in(tmp_path, two, metadata=OURS, nms_iou=0.7)
+    apart = np.array([[20, 15, 40, 25], [24.5, 15, 44.5, 25]])
+    np.testing.assert_allclose(found.boxes_xyxy_px, apart, rtol=1e-5)
 
 
-def test_what_both_networks_of_a_file_see_is_surer(tmp_path: Path) -> None:
-    """A car aslant that each of them half believes in would not be shown; two cells of one network are no witness."""
-    strides = (8, 16, 32, 16, 32, 64)
-    grid = cells((64, 64), strides)
+def test_what_both_networks_of_a_file_see_is_surer(tmp_path):
+    """A file of two networks would find no more than one of them."""
+    grid = cells((64, 64), (8, 16, 32, 16, 32, 64))
     own, their = 84 - 20, 84
-    assert grid[own].tolist() == [0, 0, 16]
-    assert grid[their].tolist() == [0, 0, 16]
+    assert grid[[own, their]].tolist() == [[0, 0, 16]] * 2
     raised = 0.35 / (0.35 + 0.65 * np.exp(-0.5))
     for first, second, expected in (
         ((own, 0.35), (their, 0.2), [raised]),
@@ -348,44 +332,24 @@ def test_what_both_networks_of_a_file_see_is_surer(tmp_path: Path) -> None:
         table = empty(len(grid), 7)
         for row, score in (first, second):
             x, y, stride = grid[row]
-            table[0, row] = [
-                20 / stride - x,
-                20 / stride - y,
-                *np.log([20 / stride, 10 / stride]),
-                score,
-                1,
-                0,
-            ]
-        path = constant_model(tmp_path / "m.onnx", table, metadata={"hvt.training_commit": "1a2b3c4"})
-        found = open_detector(str(path), confidence=0.4).detect(np.zeros((64, 64, 3), np.uint8))
+            size = np.log([20 / stride, 10 / stride])
+            table[0, row] = [20 / stride - x, 20 / stride - y, *size, score, 1, 0]
+        found = found_in(tmp_path, table, metadata=OURS, confidence=0.4)
         np.testing.assert_allclose(found.confidences, expected, rtol=1e-5)
 
 
-def test_neighbours_that_both_stay_have_boxes_of_their_own(tmp_path: Path) -> None:
-    """Two cars side by side would become one box, drawn twice."""
-    table = empty(4 + 2, 84)
-    table[0, :, 3] = [30, 20, 20, 10, 0.8, 0.0]
-    table[0, :, 9] = [34.5, 20, 20, 10, 0.7, 0.0]
-    path = constant_model(tmp_path / "m.onnx", table, metadata={"hvt.training_commit": "1a2b3c4"})
-    found = open_detector(str(path), nms_iou=0.7).detect(np.zeros((64, 64, 3), np.uint8))
-    wanted = np.array([[20, 15, 40, 25], [24.5, 15, 44.5, 25]])
-    np.testing.assert_allclose(found.boxes_xyxy_px, wanted, rtol=1e-5)
-
-
-def test_crowds_survive_up_to_the_cap() -> None:
-    """A car park of 600 cars would lose some; a broken model would flood the tracker."""
+def test_crowds_survive_up_to_the_cap():
+    """A crowd of people or a full car park would be thinned out."""
     x, y = np.meshgrid(np.arange(50.0), np.arange(40.0))
     boxes = np.stack([x, y, x + 0.9, y + 0.9], axis=-1).reshape(-1, 4).astype(np.float32) * 20
-    scores = np.linspace(1, 0.3, len(boxes), dtype=np.float32)
+    scores, kinds = np.linspace(1, 0.3, len(boxes), dtype=np.float32), np.zeros(7200, np.int32)
     crowd = np.repeat(np.arange(600), 12)
-    assert suppress(boxes[crowd], scores[crowd], np.zeros(len(crowd), np.int32), iou=0.45).tolist() == [
-        *range(0, 7200, 12)
-    ]
-    assert len(suppress(boxes, scores, np.zeros(len(boxes), np.int32), iou=0.45)) == MAX_DETECTIONS
-    assert len(suppress(boxes, scores, np.zeros(len(boxes), np.int32), iou=0.45, limit=7)) == 7
+    assert suppress(boxes[crowd], scores[crowd], kinds, iou=0.45).tolist() == [*range(0, 7200, 12)]
+    assert len(suppress(boxes, scores, kinds[: len(boxes)], iou=0.45)) == MAX_DETECTIONS
+    assert len(suppress(boxes, scores, kinds[: len(boxes)], iou=0.45, limit=7)) == 7
 
 
-def test_a_picture_full_of_boxes_costs_no_more_than_what_is_returned(monkeypatch) -> None:
+def test_a_picture_full_of_boxes_costs_no_more_than_what_is_returned(monkeypatch):
     """Of a view that it does not know a network's 8192 boxes took three seconds a picture."""
     compared: list[int] = []
     chosen = cv2.dnn.NMSBoxes
@@ -406,7 +370,7 @@ def test_a_picture_full_of_boxes_costs_no_more_than_what_is_returned(monkeypatch
 # --- opening -------------------------------------------------------------------------------------------------------
 
 
-def test_float16_models_are_fed_float16(tmp_path: Path) -> None:
+def test_float16_models_are_fed_float16(tmp_path):
     """Half-precision exports for small GPUs could not be used."""
     image = np.zeros((64, 64, 3), np.uint8)
     image[16:24, 40:48, 1] = 255
@@ -417,24 +381,17 @@ def test_float16_models_are_fed_float16(tmp_path: Path) -> None:
         assert found.class_ids.tolist() == [1]
 
 
-def test_a_free_input_takes_the_size_of_the_image_or_of_the_user(tmp_path: Path) -> None:
-    """Small objects would be shrunk away although the model could see them."""
+def test_a_free_input_takes_the_size_of_the_image_or_of_the_user(tmp_path):
+    """Small objects would be shrunk away, or a panorama would take all memory."""
     path = colour_detector(tmp_path / "m.onnx", "yolox", size=None)
     free = OnnxDetector(open_model(path))
-    sizes = [(1280, 720), (1, 1), (416, 416), (3840, 2160), (1921, 1)]
-    assert [free.input_size(size) for size in sizes] == [
-        (1280, 736),
-        (32, 32),
-        (416, 416),
-        (1920, 1088),
-        (1920, 32),
-    ]
+    wanted = {(1280, 720): (1280, 736), (1, 1): (32, 32), (416, 416): (416, 416), (1921, 1): (1920, 32)}
+    wanted |= {(3840, 2160): (1920, 1088)}
+    assert {size: free.input_size(size) for size in wanted} == wanted
     assert OnnxDetector(open_model(path), size=(416, 320)).input_size((1280, 720)) == (416, 320)
 
 
-def test_a_network_for_small_objects_has_small_images_enlarged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_for_small_objects_has_small_images_enlarged(tmp_path, monkeypatch):
     """A car of a 640x360 base is six pixels long, within one cell; a thermal camera's people grow too large.
 
     Half of these are surer where a second look, at another size, shows them too: the file's second network is silent.
@@ -442,19 +399,11 @@ def test_a_network_for_small_objects_has_small_images_enlarged(
     metadata = {"hvt.enlarge_to": "1280", "hvt.training_commit": "1a2b3c4"}
     path = colour_detector(tmp_path / "m.onnx", "yolox", size=None, metadata=metadata)
     detector = OnnxDetector(open_model(path), confidence=0.4)
-    sizes = [(640, 512), (854, 480), (1280, 720), (1920, 1080), (320, 240)]
-    assert [detector.input_size(size) for size in sizes] == [
-        (1280, 1024),
-        (1280, 736),
-        (1280, 736),
-        (1920, 1088),
-        (640, 480),
-    ]
-    assert [detector.input_size(size, thermal=True) for size in sizes[:3]] == [
-        (832, 672),
-        (864, 480),
-        (1280, 736),
-    ]
+    wanted = {(640, 512): (1280, 1024), (854, 480): (1280, 736), (1280, 720): (1280, 736)}
+    wanted |= {(1920, 1080): (1920, 1088), (320, 240): (640, 480)}
+    assert {size: detector.input_size(size) for size in wanted} == wanted
+    hot = {(640, 512): (832, 672), (854, 480): (864, 480), (1280, 720): (1280, 736)}
+    assert {size: detector.input_size(size, thermal=True) for size in hot} == hot
     inputs: list[tuple[int, ...]] = []
     run = detector.model.run
     monkeypatch.setattr(detector.model, "run", lambda *given: inputs.append(given[0].shape) or run(*given))
@@ -471,7 +420,7 @@ def test_a_network_for_small_objects_has_small_images_enlarged(
             open_detector(str(path))
 
 
-def test_names_come_from_file_then_metadata_and_never_from_a_number(tmp_path: Path) -> None:
+def test_names_come_from_file_then_metadata_and_never_from_a_number(tmp_path):
     """Overlays would show numbers, or wrong words."""
     named = str(colour_detector(tmp_path / "a.onnx", "ultralytics", metadata={"names": RGB}))
     assert open_detector(named).class_names == ("red", "green", "blue")
@@ -489,7 +438,7 @@ def test_names_come_from_file_then_metadata_and_never_from_a_number(tmp_path: Pa
         open_detector(str(wrong))
 
 
-def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path):
     """A classifier given by mistake would fly and see nothing."""
     scores = empty(7, 84)
     models = {
@@ -518,33 +467,33 @@ def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "words"),
+    ("setting", "metadata", "words"),
     [
-        ({"confidence": 1.5}, r"confidence 1\.5"),
-        ({"nms_iou": -0.1}, r"NMS IoU -0\.1"),
-        ({"size": (100, 64)}, "100x64"),
-        ({"size": (0, 64)}, "0x64"),
-        ({"size": (32, 64)}, "32x64 does not fit"),
+        ({"confidence": 1.5}, {}, r"confidence 1\.5"),
+        ({"nms_iou": -0.1}, {}, r"NMS IoU -0\.1"),
+        ({"size": (100, 64)}, {}, "100x64"),
+        ({"size": (0, 64)}, {}, "0x64"),
+        ({"size": (32, 64)}, {}, "32x64 does not fit"),
+        ({}, {"hvt.scale": "0"}, "one number or three do, not 0"),
     ],
 )
-def test_settings_out_of_range_are_refused(tmp_path: Path, setting: dict[str, Any], words: str) -> None:
-    """A mistyped number would silently detect nothing."""
-    path = str(colour_detector(tmp_path / "m.onnx", "yolox"))
+def test_settings_out_of_range_are_refused(tmp_path, setting, metadata, words):
+    """A typo would give an empty flight."""
+    path = colour_detector(tmp_path / "m.onnx", "yolox", metadata=metadata)
     with pytest.raises(UserError, match=words):
-        open_detector(path, **setting)
+        open_detector(str(path), **setting)
 
 
-def test_motion_is_a_detector_by_name() -> None:
-    """Nothing would run on a machine without any model."""
+def test_motion_is_a_detector_by_name():
+    """A flight without weights would have no detector."""
     detector = open_detector("motion", confidence=0.4)
-    assert isinstance(detector, MotionDetector)
-    assert detector.class_names == ("moving",)
+    assert (type(detector), detector.class_names) == (MotionDetector, ("moving",))
 
 
 # --- real models ---------------------------------------------------------------------------------------------------
 
 
-def reference(path: Path, image: np.ndarray, *, confidence: float, size: tuple[int, int]) -> list[tuple]:
+def reference(path, image, *, confidence, size):
     """A straightforward decode after the models' own documentation, one candidate after the other."""
     session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     yolox = "yolox" in path.name
@@ -573,7 +522,7 @@ def reference(path: Path, image: np.ndarray, *, confidence: float, size: tuple[i
     return [rows[by_class[i]] for i in kept]
 
 
-def street(data: Path) -> tuple[np.ndarray, Path]:
+def street(data):
     """The real aerial picture and its annotation file."""
     picture = data / "visdrone/0000001_02999_d_0000005.jpg"
     return cv2.imread(str(picture)), picture.with_suffix(".txt")
@@ -589,7 +538,7 @@ def street(data: Path) -> tuple[np.ndarray, Path]:
         ("yolov5su_visdrone_736x1280", (1280, 736)),
     ],
 )
-def test_real_models_agree_with_a_plain_decode(data: Path, name: str, size: tuple[int, int]) -> None:
+def test_real_models_agree_with_a_plain_decode(data, name, size):
     """A subtle mistake of scale, order or colour would cost accuracy that nobody can explain."""
     path, (image, _) = data / f"models/{name}.onnx", street(data)
     found = open_detector(str(path), confidence=0.3, size=size).detect(image)
@@ -602,28 +551,18 @@ def test_real_models_agree_with_a_plain_decode(data: Path, name: str, size: tupl
 
 
 @pytest.mark.parametrize(("fps", "every"), [(0.5, 1), (2, 1), (5, 2), (10, 3), (15, 5), (60, 5)])
-def test_the_detector_runs_three_times_a_second_where_frames_are_few(fps: float, every: int) -> None:
-    """At 2 frames a second every fifth would be one look in 2.5 s: what moves is never in one place twice."""
-    assert detect_every(None, fps=fps) == every
-    assert detect_every(7, fps=fps) == 7
+def test_the_detector_runs_three_times_a_second_where_frames_are_few(fps, every):
+    """At two frames a second no object would overlap itself; at 60 the processor would be full.
 
-
-@pytest.mark.parametrize(("given", "every"), [(None, 15), (7, 7)])
-def test_a_still_picture_is_looked_at_once_a_second(given, every) -> None:
-    """Half of the processor would go into what stands still; or a study that says how often be given less."""
-    assert detect_still_every(given, fps=15) == every
-    assert detect_still_every(given, fps=0.5) == (given or 1)
-
-
-def test_a_scale_of_nothing_is_refused(tmp_path: Path) -> None:
-    """Every pixel would be the same, or the start end in a division by it."""
-    model = family_model(tmp_path / "m.onnx", "yolov8", metadata={"hvt.scale": "0"})
-    with pytest.raises(UserError, match="one number or three do, not 0"):
-        open_detector(str(model))
+    A still picture is looked at once a second.
+    """
+    assert (detect_every(None, fps=fps), detect_every(7, fps=fps)) == (every, 7)
+    assert (detect_still_every(None, fps=15), detect_still_every(None, fps=0.5)) == (15, 1)
+    assert (detect_still_every(7, fps=15), detect_still_every(7, fps=0.5)) == (7, 7)
 
 
 @pytest.mark.parametrize("task", ["Detect", "object-detection", ""])
-def test_a_detector_by_any_word_is_one(tmp_path: Path, task: str) -> None:
+def test_a_detector_by_any_word_is_one(tmp_path, task):
     """Other exporters than Ultralytics name the task too; their models would be refused."""
     assert open_detector(
         str(family_model(tmp_path / "m.onnx", "yolov8", metadata={"task": task}))

@@ -1,7 +1,5 @@
 """The models that come with the package: that they open, say what they are, and are as good as documented."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

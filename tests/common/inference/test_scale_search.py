@@ -1,7 +1,5 @@
 """The scale is found: objects that are too small for the network are looked at enlarged, and large ones reduced."""
 
-from __future__ import annotations
-
 import logging
 
 import cv2
@@ -9,12 +7,12 @@ import numpy as np
 import pytest
 
 from hvt_common.inference.scale_search import ScaleSearch
-from hvt_common.values import Detections, Image
+from hvt_common.values import Detections
 
 SIZE = (640, 360)
 
 
-def picture(count: int, side_px: int) -> Image:
+def picture(count, side_px):
     """White squares, as many in each quarter."""
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     for number in range(count):
@@ -26,10 +24,10 @@ def picture(count: int, side_px: int) -> Image:
 class Squares:
     """A network that sees squares of 10 to 100 pixels, corners of larger ones; it counts its runs."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.runs = self.reduced = 0
 
-    def detect(self, image: Image) -> Detections:
+    def detect(self, image):
         """As wide as the picture is, enlarged or reduced."""
         if max(image.shape) <= 256:
             self.reduced += 1
@@ -42,7 +40,7 @@ class Squares:
         return Detections(boxes.reshape(-1, 4), np.full(count, 0.8, np.float32), np.zeros(count, np.int32))
 
 
-def flown(pictures: list[Image], caplog) -> tuple[list[int], list[int], ScaleSearch]:
+def flown(pictures, caplog):
     """How many objects each picture gave, the runs of each, and the search."""
     caplog.set_level(logging.INFO)
     network, found, runs = Squares(), [], []
@@ -69,7 +67,7 @@ def test_small_objects_are_looked_at_enlarged_from_the_first_second_on(caplog):
 def test_what_the_whole_picture_would_show_is_not_taken_from_a_part_of_it(side_px, found):
     """Five stripes of a crossing, 104 pixels long, were a bus for two seconds: a part hides what is around them."""
 
-    def detect(image: Image) -> Detections:
+    def detect(image):
         boxes = [[100, 100, 100 + side_px, 160]] if max(image.shape) > max(SIZE) else np.empty((0, 4))
         count = len(boxes)
         return Detections(np.array(boxes, np.float32), np.full(count, 0.8, np.float32), np.zeros(count, int))

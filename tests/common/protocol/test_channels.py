@@ -1,7 +1,5 @@
 """The key table and the edges that a pattern covers."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import pytest
@@ -31,34 +29,48 @@ def test_a_key_parses_back(edge, row):
     assert parse_key(EdgeKeys(edge)[row]) == (edge, row)
 
 
-@pytest.mark.parametrize("edge", ["", "UAV-1", "uav_1", "a/b", "a" * 33, "uav 1", "*", "uäv", "uav-1\n"])
-def test_an_edge_id_outside_the_alphabet_is_one_sentence(edge):
-    """A typo would become a key that nobody can subscribe to."""
-    with pytest.raises(UserError, match="a-z, 0-9 and '-' are accepted"):
-        EdgeKeys(edge)
-
-
 @pytest.mark.parametrize(
-    "key",
+    ("take", "says", "wrong"),
     [
-        "",
-        "hvt",
-        "hvt/uav-1",
-        "hvt/uav-1/base/x",
-        "other/uav-1/base",
-        "hvt/UAV/base",
-        "hvt/uav-1/nothing",
-        "hvt//base",
-        "hvt/uav-1/",
-        "hvt/*/base",
-        "hvt/" + "a" * 33 + "/base",
-        "/hvt/uav-1/base",
-        "hvt/uav-1/BASE",
+        (
+            *(EdgeKeys, "a-z, 0-9 and '-' are accepted"),
+            ["", "UAV-1", "uav_1", "a/b", "a" * 33, "uav 1", "*", "uäv", "uav-1\n"],
+        ),
+        (
+            *(check_edge_pattern, "'\\*' for any run"),
+            ["", "uav?", "a/b", "[a-z]", "UAV-*", "$*", "a" * 65],
+        ),
     ],
 )
-def test_a_foreign_key_is_none(key):
-    """A stranger's key would end the ground or name a recording."""
-    assert parse_key(key) is None
+def test_an_edge_id_or_pattern_outside_the_alphabet_is_one_sentence(take, says, wrong):
+    """A slash or a star in a name would put messages under another edge's key, or match none."""
+    for one in wrong:
+        with pytest.raises(UserError, match=says):
+            take(one)
+
+
+def test_a_foreign_key_is_none():
+    """Another program under the same router would be taken for an edge."""
+    for key in (
+        *(
+            "",
+            "hvt",
+            "hvt/uav-1",
+            "hvt/uav-1/base/x",
+            "other/uav-1/base",
+            "hvt/UAV/base",
+            "hvt/uav-1/nothing",
+        ),
+        *(
+            "hvt//base",
+            "hvt/uav-1/",
+            "hvt/*/base",
+            f"hvt/{'a' * 33}/base",
+            "/hvt/uav-1/base",
+            "hvt/uav-1/BASE",
+        ),
+    ):
+        assert parse_key(key) is None
 
 
 @given(key=st.text(max_size=60))
@@ -75,37 +87,24 @@ def test_the_selector_and_the_pattern_agree(edge, pattern):
     assert key_expr.includes(key) == matches(edge, edges=pattern)
 
 
-@pytest.mark.parametrize("pattern", ["", "uav?", "a/b", "[a-z]", "UAV-*", "$*", "a" * 65])
-def test_a_pattern_outside_the_alphabet_is_one_sentence(pattern):
-    """A pattern that Zenoh reads otherwise would silently match nothing."""
-    with pytest.raises(UserError, match="'\\*' for any run"):
-        check_edge_pattern(pattern)
-
-
-def test_the_table_is_whole_and_its_names_are_zenohs():
-    """A stream without a delivery would go out with Zenoh's defaults: dropped under load."""
+def test_the_table_is_whole_and_its_priorities_hold():
+    """A row would have no priority; a dropped one would block, or stills would delay video, and video commands."""
     assert set(DELIVERIES) == set(Channel)
+    seen = defaultdict(set)
     for delivery in DELIVERIES.values():
         assert hasattr(zenoh.Priority, delivery.priority)
         assert hasattr(zenoh.CongestionControl, delivery.congestion)
-
-
-def test_no_priority_carries_both_blocking_and_dropping_rows():
-    """They disturb each other: a full queue of one would stall the other."""
-    seen = defaultdict(set)
-    for delivery in DELIVERIES.values():
         if delivery.direction is not Direction.PRESENCE:
             seen[delivery.priority].add(delivery.congestion)
     assert all(len(kinds) == 1 for kinds in seen.values()), dict(seen)
-
-
-def test_stills_yield_to_video_and_video_to_commands():
-    """A keyframe request would wait behind the stills that the operator does not care about now."""
     order = [
         "REAL_TIME",
         "INTERACTIVE_HIGH",
         "INTERACTIVE_LOW",
-        *("DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"),
+        "DATA_HIGH",
+        "DATA",
+        "DATA_LOW",
+        "BACKGROUND",
     ]
     rank = {row: order.index(delivery.priority) for row, delivery in DELIVERIES.items()}
     assert rank[Channel.CONTROL] < rank[Channel.STATUS] < rank[Channel.BASE] < rank[Channel.ROI]

@@ -1,11 +1,10 @@
 """Time on both sides: a clock without steps, and the offset between two of them."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,9 +15,7 @@ MS, SECOND_NS = 1_000_000, 1_000_000_000
 delays = st.integers(0, 5_000 * MS)
 
 
-def exchange(
-    clock: ClockOffset, *, at_ns: int, offset_ns: int, out_ns: int, held_ns: int, back_ns: int
-) -> bool:
+def exchange(clock, *, at_ns, offset_ns, out_ns, held_ns, back_ns):
     """A question at ``at_ns`` to a clock that is ``offset_ns`` ahead."""
     heard = at_ns + out_ns
     return clock.add(
@@ -30,13 +27,13 @@ def exchange(
 
 
 def test_an_even_path_gives_the_exact_offset():
-    """Latency in the summary would be wrong by the difference of the clocks."""
+    """Every delay that is shown would be off; times that contradict each other are left out."""
     clock = ClockOffset()
-    assert clock.estimate is None
-    assert clock.to_local_ns(5) == 5
+    assert not clock.add(t0_ns=10, t1_ns=0, t2_ns=100, t3_ns=20)
+    assert not clock.add(t0_ns=0, t1_ns=50, t2_ns=40, t3_ns=90)
+    assert (clock.estimate, clock.to_local_ns(5)) == (None, 5)
     assert exchange(clock, at_ns=0, offset_ns=-70 * MS, out_ns=4 * MS, held_ns=9 * MS, back_ns=4 * MS)
-    assert clock.estimate == (-70 * MS, 4 * MS)
-    assert clock.to_local_ns(1_000 * MS) == 1_070 * MS
+    assert (clock.estimate, clock.to_local_ns(1_000 * MS)) == ((-70 * MS, 4 * MS), 1_070 * MS)
 
 
 @given(
@@ -63,14 +60,6 @@ def test_the_shortest_round_trip_speaks_until_it_is_old():
     assert clock.offset_ns == 0
     exchange(clock, at_ns=61_000 * MS, offset_ns=8 * MS, out_ns=2 * MS, held_ns=0, back_ns=2 * MS)
     assert clock.offset_ns == 8 * MS
-
-
-def test_contradictory_times_are_left_out():
-    """A stepped clock would give a negative round trip, which always wins."""
-    clock = ClockOffset()
-    assert not clock.add(t0_ns=10, t1_ns=0, t2_ns=100, t3_ns=20)
-    assert not clock.add(t0_ns=0, t1_ns=50, t2_ns=40, t3_ns=90)
-    assert clock.estimate is None
 
 
 def test_no_picture_comes_before_it_was_captured():
@@ -109,7 +98,7 @@ def test_two_threads_may_use_it():
     clock, done, seen = ClockOffset(), threading.Event(), set()
     exchange(clock, at_ns=0, offset_ns=3_600_000 * MS, out_ns=MS, held_ns=0, back_ns=MS)
 
-    def read() -> None:
+    def read():
         while not done.is_set():
             seen.update((clock.offset_ns, clock.estimate, clock.to_local_ns(0)))
 
@@ -141,26 +130,31 @@ def test_a_clock_that_was_set_is_believed_at_once():
     assert clock.estimate == (3_600_000 * MS, 40 * MS)
 
 
-def test_a_clock_that_was_wrong_at_the_start_is_said_once(caplog):
-    """A drone without a battery for its clock would record a flight of 1970, and nobody would know why."""
-    wall, monotonic = [1_000_000 * MS], [5_000 * MS]
-    clock = SteadyClock(wall_ns=lambda: wall[0], monotonic_ns=lambda: monotonic[0])
+@pytest.fixture
+def wall():
+    """The wall clock and the time since boot, which a test sets; a steady clock that began at 5 s."""
+    now = {"wall_ns": 1_000_000 * MS, "monotonic_ns": 5_000 * MS}
+    return now, SteadyClock(wall_ns=lambda: now["wall_ns"], monotonic_ns=lambda: now["monotonic_ns"])
+
+
+def test_a_clock_that_was_wrong_at_the_start_is_said_once(caplog, wall):
+    """An operator would wonder for the whole flight why all times are wrong."""
+    now, clock = wall
     for drift_ms, said in ((9_000, 0), (3_600_000, 1), (7_200_000, 1), (0, 1)):
-        monotonic[0] += 2_000 * MS
-        wall[0] = 995_000 * MS + monotonic[0] + drift_ms * MS
-        assert clock() == 995_000 * MS + monotonic[0]
+        now["monotonic_ns"] += 2_000 * MS
+        now["wall_ns"] = 995_000 * MS + now["monotonic_ns"] + drift_ms * MS
+        assert clock() == 995_000 * MS + now["monotonic_ns"]
         assert len(caplog.records) == said
     assert caplog.records[0].getMessage().startswith("the clock of this machine was set by +3600 s")
 
 
-def test_a_wall_clock_that_is_set_leaves_no_step():
-    """NTP coming up in mid-flight would look like an hour in a queue, or silence the camera for as long."""
-    wall, monotonic = [1_000_000 * MS], [5_000 * MS]
-    clock = SteadyClock(wall_ns=lambda: wall[0], monotonic_ns=lambda: monotonic[0])
+def test_a_wall_clock_that_is_set_leaves_no_step(wall):
+    """A frame would be an hour long, and all that waits be stale."""
+    now, clock = wall
     shown = [clock()]
     for step_ms in (3_600_000, -7_200_000, 0):
-        wall[0] += (step_ms + 40) * MS
-        monotonic[0] += 40 * MS
+        now["wall_ns"] += (step_ms + 40) * MS
+        now["monotonic_ns"] += 40 * MS
         shown.append(clock())
     assert shown == [(1_000_000 + 40 * step) * MS for step in range(4)]
 

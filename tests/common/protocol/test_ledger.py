@@ -1,9 +1,9 @@
 """The account of line bytes and its rolling windows."""
 
-from __future__ import annotations
-
+import itertools
 import pickle
 import random
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -22,17 +22,13 @@ events = st.lists(
 )
 
 
-def dated(gaps: list) -> list:
-    """Events with times that never go back."""
-    at = 0
-    out = []
-    for gap, channel, payload, attachment in gaps:
-        at += gap
-        out.append((at, channel, payload, attachment))
-    return out
+def dated(gaps):
+    """(at_ns, channel, payload, attachment) in the order of time."""
+    times = itertools.accumulate(gap for gap, *_ in gaps)
+    return [(at, *rest) for at, (_, *rest) in zip(times, gaps, strict=True)]
 
 
-def fed(items: list) -> Ledger:
+def fed(items):
     """A ledger that counted these events."""
     ledger = Ledger(window_ns=WINDOW, slack_ns=SLACK)
     for at, channel, payload, attachment in items:
@@ -40,7 +36,7 @@ def fed(items: list) -> Ledger:
     return ledger
 
 
-def brute(items: list, channel: Account | None, now: int) -> int:
+def brute(items, channel, now):
     """A window's line bytes, from the definition."""
     return sum(
         payload + attachment + 66
@@ -49,7 +45,7 @@ def brute(items: list, channel: Account | None, now: int) -> int:
     )
 
 
-def brute_worst(items: list, channel: Account | None) -> int:
+def brute_worst(items, channel):
     """The fullest window in bits a second, from the definition."""
     return max(brute(items, channel, at) for at, *_ in items) * 8 * 1_000_000
 
@@ -83,41 +79,33 @@ def test_slightly_other_order_gives_the_same_account(gaps, seed):
 
 
 def test_totals_put_every_byte_in_one_place():
-    """Metadata would hide in the payload or be counted twice."""
+    """The budget and the report would not add up."""
     ledger = Ledger()
-    ledger.count(Account.BASE, payload_bytes=5_000, attachment_bytes=39, overhead_bytes=240, at_ns=0)
-    ledger.count(Account.ROI, payload_bytes=1_500, attachment_bytes=90, overhead_bytes=136, at_ns=10)
-    ledger.count(Account.META, payload_bytes=200, attachment_bytes=0, overhead_bytes=84, at_ns=20)
-    ledger.count(Account.BACKLOG, payload_bytes=700, attachment_bytes=40, overhead_bytes=120, at_ns=20)
+    for channel, payload, attachment, overhead, at_ns in (
+        (Account.BASE, 5_000, 39, 240, 0),
+        (Account.ROI, 1_500, 90, 136, 10),
+        (Account.META, 200, 0, 84, 20),
+        (Account.BACKLOG, 700, 40, 120, 20),
+    ):
+        sizes: Any = {"payload_bytes": payload, "attachment_bytes": attachment}
+        ledger.count(channel, **sizes, overhead_bytes=overhead, at_ns=at_ns)
     summary = ledger.summary(2.0)
     assert (summary.base_bytes, summary.roi_bytes, summary.backlog_bytes) == (5_000, 1_500, 700)
     assert (summary.meta_bytes, summary.overhead_bytes) == (39 + 90 + 40 + 200, 240 + 136 + 120 + 84)
     assert summary.line_bytes == ledger.line_bytes == 5_279 + 1_726 + 860 + 284
     assert summary.messages == {"base": 1, "roi": 1, "backlog": 1, "meta": 1}
-    assert (summary.base_bps, summary.roi_bps) == (5_279 * 4, 1_726 * 4)
-    assert summary.total_bps == (5_279 + 1_726 + 860 + 284) * 4
+    assert (summary.base_bps, summary.roi_bps, summary.total_bps) == (5_279 * 4, 1_726 * 4, 8_149 * 4)
     assert ledger.messages(Account.ROI) == 1
-
-
-def test_an_empty_run_has_rates_of_zero():
-    """A run that ended before its first frame would end in a division by zero."""
-    summary = Ledger().summary(0.0)
-    assert summary.total_bps == 0
-    assert summary.worst_window_bps.total == 0
+    empty = Ledger().summary(0.0)
+    assert (empty.total_bps, empty.worst_window_bps.total) == (0, 0)
 
 
 def test_memory_stays_flat():
-    """The process would grow over hours of flight."""
-    ledger = Ledger()
-    sizes = set()
+    """An edge that flies for hours would run out of memory."""
+    ledger, sizes = Ledger(), set()
+    of_one: Any = {"payload_bytes": 5_000, "attachment_bytes": 40, "overhead_bytes": 240}
     for frame in range(20_000):
-        ledger.count(
-            Account.BASE,
-            payload_bytes=5_000,
-            attachment_bytes=40,
-            overhead_bytes=240,
-            at_ns=frame * 66_666_667,
-        )
+        ledger.count(Account.BASE, **of_one, at_ns=frame * 66_666_667)
         if frame > 100 and frame % 50 == 0:
             sizes.add(len(pickle.dumps(ledger)))
     assert max(sizes) <= 1.1 * min(sizes)
@@ -136,18 +124,14 @@ def test_a_clock_set_back_starts_the_windows_afresh():
 
 
 def test_fates_are_counted_by_reason():
-    """Nobody could tell why a still never came."""
+    """Nobody would learn why an object has no still."""
     ledger = Ledger()
-    ledger.record_outcome("sent", "small")
-    ledger.record_outcome("sent", "small")
     ledger.record_outcome("dropped", "stale")
+    for _ in range(2):
+        ledger.record_outcome("sent", "small")
     assert ledger.outcomes("sent") == {"small": 2}
-    assert ledger.summary(1.0).outcomes == {
-        "sent": {"small": 2},
-        "deferred": {},
-        "dropped": {"stale": 1},
-        "received": {},
-    }
+    wanted = {"sent": {"small": 2}, "deferred": {}, "dropped": {"stale": 1}, "received": {}}
+    assert ledger.summary(1.0).outcomes == wanted
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Poses on the wire: small, and never another than was sent."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -19,7 +17,7 @@ SECOND_NS = 1_000_000_000
 SESSION = 2**63 + 5
 
 
-def flight(count: int, *, seed: int = 0) -> list[Pose]:
+def flight(count, *, seed=0):
     """A vehicle at 15 m/s in wide turns, a gimbal that tracks something, and noisy sensors."""
     noise = np.random.default_rng(seed)
     poses = []
@@ -47,37 +45,26 @@ def flight(count: int, *, seed: int = 0) -> list[Pose]:
 
 
 def test_a_flight_takes_300_bits_a_second_and_comes_as_it_was_sent():
-    """On a thin link the pose would cost more than it is worth; or places drift from where they were."""
+    """Poses would take from the video, or put an object into another field; a fixed camera takes less."""
     encoder, decoder = PoseEncoder(session_id=SESSION), PoseDecoder()
     sizes = []
     for pose in flight(300):
         data = encoder.encode(pose)(pose.capture_ns + 5_000_000).pack()
         sizes.append(len(data))
         come = decoder.decode(PoseReport.parse(data))
-        assert come is not None
         assert come.capture_ns == pose.capture_ns
-        assert (come.latitude_deg, come.longitude_deg) == pytest.approx(
-            (pose.latitude_deg, pose.longitude_deg), abs=0.51e-7
-        )
-        assert come.height_m == pytest.approx(pose.height_m, abs=0.051)
-        assert come.camera is not None
-        assert pose.camera is not None
+        place = (pose.latitude_deg, pose.longitude_deg)
+        assert (come.latitude_deg, come.longitude_deg) == pytest.approx(place, abs=0.51e-7)
+        tenths = (pose.height_m, pose.camera.pitch_deg)
+        assert (come.height_m, come.camera.pitch_deg) == pytest.approx(tenths, abs=0.051)
         assert abs((come.camera.yaw_deg - pose.camera.yaw_deg + 180) % 360 - 180) <= 0.051
-        assert come.camera.pitch_deg == pytest.approx(pose.camera.pitch_deg, abs=0.051)
         assert pose.position_error_m <= come.position_error_m <= pose.position_error_m * 1.42
     assert 8 * np.mean(sizes) <= 300
     assert max(sizes) <= PoseReport.MAX_BYTES
-
-
-def test_a_fixed_camera_takes_less():
-    """It would pay for a place that never changes."""
     encoder = PoseEncoder(session_id=SESSION)
     fixed = Pose(START_NS, 52.0, 13.0, height_m=12, camera=Orientation(90, -30, 0), hfov_deg=70)
-    sizes = [
-        len(encoder.encode(replace(fixed, capture_ns=START_NS + n * SECOND_NS))(START_NS).pack())
-        for n in range(60)
-    ]
-    assert 8 * np.mean(sizes) <= 250
+    poses = [replace(fixed, capture_ns=START_NS + n * SECOND_NS) for n in range(60)]
+    assert 8 * np.mean([len(encoder.encode(one)(START_NS).pack()) for one in poses]) <= 250
 
 
 def test_after_a_loss_nothing_is_shown_before_a_report_stands_by_itself():
@@ -101,16 +88,13 @@ def test_after_an_outage_no_report_builds_on_one_of_before_it_that_has_the_numbe
 
 
 def test_what_is_not_known_is_not_sent():
-    """A ground would draw a camera that points north at the horizon."""
+    """A height of 0 m would be shown of a camera without an altimeter."""
     encoder, decoder = PoseEncoder(session_id=SESSION), PoseDecoder()
     bare = Pose(START_NS, -33.5, 151.2)
     come = decoder.decode(encoder.encode(bare)(START_NS))
-    assert come is not None
     assert (come.height_m, come.altitude_m, come.camera, come.platform, come.hfov_deg) == (None,) * 5
     known = replace(bare, capture_ns=START_NS + SECOND_NS, height_m=50.0)
-    come = decoder.decode(encoder.encode(known)(START_NS))
-    assert come is not None
-    assert come.height_m == 50.0
+    assert decoder.decode(encoder.encode(known)(START_NS)).height_m == 50.0
 
 
 @pytest.mark.parametrize(
@@ -143,12 +127,9 @@ def test_any_bytes_are_a_pose_or_refused(messages):
         assert pose is None or (abs(pose.latitude_deg) <= 90 and abs(pose.longitude_deg) <= 180)
 
 
-@given(
-    st.lists(st.tuples(st.integers(-(2**36), 2**36), st.integers(0, 8)), max_size=20),
-    st.integers(0, 2**12 - 1),
-)
+@given(st.lists(st.tuples(st.integers(-(2**36), 2**36), st.integers(0, 8))), st.integers(0, 2**12 - 1))
 def test_numbers_come_back(numbers, plain):
-    """The two sides would disagree about a code."""
+    """A pose would be another one; readers in other languages follow the standard's codes."""
     out = BitWriter()
     out.u(plain, 12)
     for value, order in numbers:
@@ -157,12 +138,14 @@ def test_numbers_come_back(numbers, plain):
     assert bits.u(12) == plain
     assert [bits.se(order) for _, order in numbers] == [value for value, _ in numbers]
     bits.finish()
-
-
-def test_codes_are_those_of_the_standard():
-    """An outside reader by ITU-T H.264, 9.1, table 9-2 would read other numbers."""
-    table = {0: "1", 1: "010", -1: "011", 2: "00100", -2: "00101", 3: "00110", -3: "00111"}
-    for value, code in table.items():
-        out = BitWriter()
-        out.se(value, 0)
-        assert f"{int.from_bytes(out.ended(stop=''), 'big'):08b}" == code.ljust(8, "0")
+    for value, code in {
+        0: "1",
+        1: "010",
+        -1: "011",
+        2: "00100",
+        -2: "00101",
+        3: "00110",
+        -3: "00111",
+    }.items():
+        coded = BitWriter().se(value).ended(stop="")
+        assert f"{int.from_bytes(coded, 'big'):08b}" == code.ljust(8, "0")

@@ -1,22 +1,19 @@
 """The log as programs read it: one JSON object a line, of real flights and of programs that fail."""
 
-from __future__ import annotations
-
 import json
-import subprocess
-import sys
 from datetime import datetime
 
 import pytest
 
 from hvt_edge.cli import main
+from programs.processes import python
 
 pytestmark = pytest.mark.integration
 
 JSON = ("--log-format", "json")
 
 
-def lines(said: str) -> list[dict]:
+def lines(said):
     """Each must be an object."""
     return [json.loads(line) for line in said.splitlines()]
 
@@ -56,15 +53,13 @@ log.release()
 
 def test_a_line_of_one_edge_names_it():
     """Of a ground of many edges nobody could tell whose line it is."""
-    done = subprocess.run([sys.executable, "-c", EDGES], capture_output=True, text=True, check=True)
-    told = [(one["message"], one.get("edge"), one.get("session")) for one in lines(done.stderr)]
-    assert told == [
-        ("uav-1: damaged", "uav-1", "1f"),
-        ("uav-1: ended", "uav-1", None),
-        ("uav-2: damaged", "uav-2", "1f"),
-        ("uav-2: ended", "uav-2", None),
-        ("of none", None, None),
+    told = [(one["message"], one.get("edge"), one.get("session")) for one in lines(python(EDGES).stderr)]
+    of_edges = [
+        (f"{edge}: {what}", edge, session)
+        for edge in ("uav-1", "uav-2")
+        for what, session in (("damaged", "1f"), ("ended", None))
     ]
+    assert told == [*of_edges, ("of none", None, None)]
 
 
 @pytest.mark.parametrize(
@@ -94,8 +89,7 @@ raise KeyError("of the program")
 
 def test_a_traceback_is_inside_its_object():
     """Each of its lines would be an entry of its own, between those of other services."""
-    done = subprocess.run([sys.executable, "-c", BUG], capture_output=True, text=True, check=False)
-    first, second = lines(done.stderr)
+    first, second = lines(python(BUG, check=False).stderr)
     assert "ValueError: of a thread" in first["traceback"]
     assert second["traceback"].startswith("Traceback")
     assert (first["level"], second["message"]) == ("critical", "KeyError: 'of the program'")

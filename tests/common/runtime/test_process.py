@@ -1,7 +1,5 @@
 """A process frees the frames of its threads, and ends with its own exit code."""
 
-from __future__ import annotations
-
 import os
 import platform
 import signal
@@ -21,18 +19,20 @@ from hvt_common.runtime.process import (
     stop_on_signals,
 )
 from hvt_edge.video.x265 import NewThreads
+from programs.processes import python
 
 only_with_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is about glibc's heaps")
 
 
 @pytest.mark.parametrize("one", STOP_SIGNALS)
 def test_each_way_to_stop_a_program_ends_it_in_order(one):
-    """Ctrl-C, a service manager or a closed terminal would cost the summary and the end of the recording."""
-    signal.signal(one, signal.SIG_DFL)
-    stop = stop_on_signals()
-    assert not stop.is_set()
-    signal.raise_signal(one)
-    assert stop.is_set()
+    """A closed terminal, systemd or Ctrl-C would leave half a recording; ``nohup`` is heeded."""
+    for before, stops in ((signal.SIG_DFL, True), (signal.SIG_IGN, one is not signal.SIGHUP)):
+        signal.signal(one, before)
+        stop = stop_on_signals()
+        assert not stop.is_set()
+        signal.raise_signal(one)
+        assert stop.is_set() is stops
 
 
 STOPPED = """
@@ -80,14 +80,6 @@ def test_a_program_that_hangs_needs_no_kill(one, within, what, code):
         assert run.wait(60) == (128 + one if what == "again" else code)
 
 
-def test_nohup_is_heeded():
-    """A flight that was started to outlive its terminal would end with it."""
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    stop = stop_on_signals()
-    signal.raise_signal(signal.SIGHUP)
-    assert not stop.is_set()
-
-
 FRAMES = """
 import threading
 import numpy as np, psutil
@@ -117,30 +109,24 @@ go_on.set()
 """
 
 
-def resident_mb(*, asked: bool, **more: str) -> int:
+def resident_mb(*, asked, **more):
     """Of a process in which ten threads have held 30 MB each, in turn."""
     around = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")} | more
-    done = subprocess.run(
-        [sys.executable, "-c", FRAMES.format(asked=asked)],
-        env=around,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return int(done.stdout)
+    return int(python(FRAMES.format(asked=asked), env=around).stdout)
 
 
 @only_with_glibc
 def test_threads_share_the_room_of_frames():
-    """The edge would grow in steps for hours, and its system would end it in the air."""
-    few, many = resident_mb(asked=True), resident_mb(asked=False, MALLOC_ARENA_MAX="16")
-    assert few < many - 100
-
-
-@only_with_glibc
-def test_who_has_asked_for_another_allocation_keeps_it():
-    """An operator who has tuned the allocator would be overruled in silence."""
-    assert resident_mb(asked=True, MALLOC_ARENA_MAX="16") > resident_mb(asked=True) + 100
+    """An edge would grow for hours by what ten threads held in turn; who asks for another allocation keeps it."""
+    few, many, asked = (
+        resident_mb(asked=asked, **more)
+        for asked, more in (
+            (True, {}),
+            (False, {"MALLOC_ARENA_MAX": "16"}),
+            (True, {"MALLOC_ARENA_MAX": "16"}),
+        )
+    )
+    assert few < min(many, asked) - 100
 
 
 HOLES = """
@@ -161,8 +147,7 @@ print(held - psutil.Process().memory_info().rss >> 20)
 @only_with_glibc
 def test_what_lies_between_pictures_is_given_back():
     """The peaks of different threads would add up, 20 MB of an edge's."""
-    done = subprocess.run([sys.executable, "-c", HOLES], capture_output=True, text=True, check=True)
-    assert int(done.stdout) >= 40, "of 60"
+    assert int(python(HOLES).stdout) >= 40, "of 60"
 
 
 @pytest.mark.parametrize(
@@ -206,19 +191,19 @@ leave(3)
 
 def test_a_process_ends_with_its_code_while_a_detection_runs():
     """Python ends such a thread as it finalizes, and onnxruntime aborts: a good flight would count as failed."""
-    done = subprocess.run([sys.executable, "-c", DETECTING], capture_output=True, text=True, check=False)
+    done = python(DETECTING, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (3, "all was written", "")
 
 
-def niceness(thread: int) -> int:
+def niceness(thread):
     """Of a thread by its native id."""
     return os.getpriority(os.PRIO_PROCESS, thread)
 
 
-def may_raise_priority() -> bool:
+def may_raise_priority():
     """Whether a thread that has lowered its priority may take it back here."""
 
-    def tried() -> bool:
+    def tried():
         lower_priority()
         try:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness(os.getpid()))
@@ -238,7 +223,7 @@ def test_a_library_that_lowers_its_own_workers_gets_them_back():
     """x265 does: each frame would wait behind the detector."""
     lowered, end = threading.Event(), threading.Event()
 
-    def work() -> None:
+    def work():
         lower_priority()
         lowered.set()
         end.wait()
@@ -281,12 +266,9 @@ with open_session(LinkSettings(role="edge", connect=("tcp/127.0.0.1:9",))):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks at the names of threads")
-def test_zenoh_shares_its_threads() -> None:
+def test_zenoh_shares_its_threads():
     """Each of three more would take megabytes of a small computer."""
     around = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
-    done = subprocess.run(
-        [sys.executable, "-c", ZENOH_THREADS], env=around, capture_output=True, text=True, check=True
-    )
-    names = set(done.stdout.split())
+    names = set(python(ZENOH_THREADS, env=around).stdout.split())
     assert "app" in names
     assert not names & {"net", "acc", "rx"}

@@ -1,7 +1,5 @@
 """What a run says of itself."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -26,21 +24,16 @@ def test_the_summary_file_is_written_whole(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_summary_can_go_into_a_pipe(tmp_path):
-    """``--summary /dev/stdout`` would fail after the run, or replace the device."""
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    got: list[str] = []
+def test_a_summary_goes_into_a_pipe_and_through_a_link(tmp_path):
+    """A script that reads it would wait for ever; a link would become a file on the wrong disk."""
+    os.mkfifo(pipe := tmp_path / "pipe")
+    got = []
     reader = threading.Thread(target=lambda: got.append(pipe.read_text()))
     reader.start()
     write_json(pipe, [{"edge": "uav-1"}])
     reader.join(60)
     assert json.loads(got[0]) == [{"edge": "uav-1"}]
     assert pipe.is_fifo()
-
-
-def test_a_summary_goes_through_a_link(tmp_path):
-    """The link, of a disk with room, was replaced by a file, and what it leads to stayed as it was."""
     (tmp_path / "disk").mkdir()
     link, file = tmp_path / "summary.json", tmp_path / "disk" / "summary.json"
     link.symlink_to(file)
@@ -73,9 +66,12 @@ def test_a_summary_into_a_pipe_that_nobody_reads_is_a_sentence(tmp_path, monkeyp
 
 
 def test_files_that_cannot_be_written_are_refused_before_the_run(tmp_path):
-    """The numbers of an hour's flight would be lost at its end."""
+    """An hour's flight would end without its summary; or the check lose yesterday's."""
     check_writable(None, name="--summary")
     check_writable(tmp_path / f"{'new' * 61}12.json", name="--summary")
+    (there := tmp_path / "s.json").write_text("yesterday")
+    check_writable(there, name="--summary")
+    assert there.read_text() == "yesterday"
     for path, said in (
         (tmp_path, "is a folder: name a file"),
         (tmp_path / "none" / "s.json", "is in a folder that does not exist: make "),
@@ -86,47 +82,25 @@ def test_files_that_cannot_be_written_are_refused_before_the_run(tmp_path):
             check_writable(path, name="--summary")
 
 
-def test_what_was_in_a_file_survives_the_check(tmp_path):
-    """A run that fails at once would already have emptied yesterday's summary."""
-    path = tmp_path / "s.json"
-    path.write_text("yesterday")
-    check_writable(path, name="--summary")
-    assert path.read_text() == "yesterday"
-
-
-def test_a_table_says_paths_and_names_as_they_are(capsys):
-    """A recording in a folder ``[run 1]`` would be shown under another name, or the table would crash."""
+def test_a_table_says_paths_and_names_as_they_are(monkeypatch, capsys):
+    """A folder called [run 1] would vanish from the table, or a narrow terminal cut words."""
     print_table("uav[/]1", [("recording", "/data/[run 1]/[/bold]:car:.rrd"), ("[red]", "x")])
     out = capsys.readouterr().out
-    assert "/data/[run 1]/[/bold]:car:.rrd" in out
-    assert "uav[/]1" in out
-    assert "[red]" in out
-
-
-def test_a_narrow_terminal_cuts_no_word(monkeypatch, capsys):
-    """Of ``objects`` and ``preset`` it left ``obje…`` and ``pres…``."""
+    assert [one for one in ("/data/[run 1]/[/bold]:car:.rrd", "uav[/]1", "[red]") if one not in out] == []
     monkeypatch.setenv("COLUMNS", "24")
     print_table("uav-1", [("not sent yet", "15 objects")])
     assert "…" not in capsys.readouterr().out
 
 
 def test_a_log_gets_a_line_now_and_then(capsys):
-    """An hour's log would hold thousands of status lines, or none."""
-    with StatusLine(quiet=False) as line:
-        for number in range(11):
-            line.show(f"frame {number}")
-        line.note("[note] :wave:")
-    err = capsys.readouterr().err
-    assert [one for one in err.splitlines() if one.startswith("frame")] == ["frame 0", "frame 5", "frame 10"]
-    assert "[note] :wave:" in err
-
-
-def test_quiet_is_quiet(capsys):
-    """``--quiet`` would not be."""
-    with StatusLine(quiet=True) as line:
-        line.show("status")
-        line.note("note")
-    assert capsys.readouterr() == ("", "")
+    """A service's log would have a line a second; with --quiet any at all."""
+    for quiet in (False, True):
+        with StatusLine(quiet=quiet) as line:
+            for number in range(11):
+                line.show(f"frame {number}")
+            line.note("[note] :wave:")
+        err = capsys.readouterr().err
+        assert err.splitlines() == ([] if quiet else ["frame 0", "frame 5", "frame 10", "[note] :wave:"])
 
 
 def test_a_result_that_cannot_be_written_is_a_sentence_and_code_1(tmp_path, capsys):
@@ -144,7 +118,7 @@ def test_a_result_that_cannot_be_written_is_a_sentence_and_code_1(tmp_path, caps
 def test_a_disk_without_room_leaves_no_half_of_a_summary(tmp_path, monkeypatch):
     """Each start of a service on a full disk would leave an empty file there."""
 
-    def full(path: Path, *_: object, **__: object) -> int:
+    def full(path, *_, **__):
         path.touch()
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -1,10 +1,8 @@
 """HVT speaks over its link and nowhere else."""
 
-from __future__ import annotations
-
 import os
-import subprocess
-import sys
+
+from programs.processes import python
 
 SEE = """
 import sys
@@ -24,13 +22,7 @@ def test_a_network_that_runs_leaves_and_sends_nothing(tmp_path):
     known = {
         name: value for name, value in os.environ.items() if name in ("PATH", "LD_LIBRARY_PATH", "PYTHONPATH")
     }
-    done = subprocess.run(
-        [sys.executable, "-c", SEE],
-        env={**known, "HOME": str(home)},
-        capture_output=True,
-        check=False,
-        text=True,
-    )
+    done = python(SEE, env={**known, "HOME": str(home)}, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 0
     assert not [path for path in home.rglob("*") if path.is_file()]

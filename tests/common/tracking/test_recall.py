@@ -1,7 +1,5 @@
 """What is thought of an object that only one of two observers sees."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,14 +11,14 @@ CONFIDENCES = np.linspace(0, 1, 101).tolist()
 CAR, PERSON, BUS = range(3)
 
 
-def take(recall: Recall, at_s: float, *counts: tuple[int, int, int]) -> None:
+def take(recall, at_s, *counts):
     """Of each class (class id, how many were reported, how many were there)."""
     ids = [one for class_id, _, there in counts for one in [class_id] * there]
     reported = [number < some for _, some, there in counts for number in range(there)]
     recall.take(np.array(ids, np.int32), reported=np.array(reported, bool), at_s=at_s)
 
 
-def heard(*pictures: tuple[int, int]) -> Recall:
+def heard(*pictures):
     """Of an observer who reported so many cars of so many that were surely there, three pictures a second."""
     recall = Recall()
     for number, (reported, there) in enumerate(pictures):

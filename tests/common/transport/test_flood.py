@@ -1,7 +1,5 @@
 """What gives way when far more comes than can be looked at, and that it is told of once."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 
@@ -35,29 +33,23 @@ def test_of_a_flood_some_comes_through():
 
 
 def test_one_row_does_not_keep_the_others_out_of_the_inbox():
-    """Reports by the thousand would take the place of every picture."""
+    """A flood of status would leave no room for video, in messages or in bytes."""
     inbox = Inbox(capacity=8, share=0.75)
-    for _ in range(50):
-        inbox.put(replace(ITEM, key="hvt/uav-1/status"))
-    assert (len(inbox), inbox.dropped) == (6, 44)
-    for _ in range(3):
-        inbox.put(ITEM)
-    assert (len(inbox), inbox.dropped) == (8, 45)
+
+    def put(count, **other):
+        for _ in range(count):
+            inbox.put(replace(ITEM, **other))
+        return len(inbox), inbox.dropped
+
+    assert put(50, key="hvt/uav-1/status") == (6, 44)
+    assert put(3) == (8, 45)
     assert inbox.get(timeout_s=0).key == "hvt/uav-1/status"
-    inbox.put(ITEM)
+    put(1)
     assert [inbox.get(timeout_s=0).key.rpartition("/")[2] for _ in range(8)] == ["status"] * 5 + ["base"] * 3
-    for _ in range(6):
-        inbox.put(ITEM)
-    assert len(inbox) == 6, "what was taken out makes room again"
-
-
-def test_one_row_does_not_take_all_bytes_of_the_inbox():
-    """A few huge messages would do what thousands of small ones may not."""
+    assert put(6)[0] == 6, "what was taken out makes room again"
     inbox = Inbox(capacity=100, capacity_bytes=1000, share=0.5)
-    for _ in range(9):
-        inbox.put(ITEM)
-    inbox.put(replace(ITEM, key="hvt/uav-1/roi"))
-    assert (len(inbox), inbox.dropped) == (6, 4)
+    put(9)
+    assert put(1, key="hvt/uav-1/roi") == (6, 4)
 
 
 def test_the_account_of_a_flood_stays_small():

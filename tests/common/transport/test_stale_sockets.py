@@ -1,7 +1,5 @@
 """A link comes back although what a dark line left behind stands in its way."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -32,7 +30,7 @@ SO_TIMESTAMPNS = 35
 pytestmark = pytest.mark.skipif(not TCP_TABLES[0].exists(), reason="needs the kernel's table")
 
 
-def lingering() -> list[int]:
+def lingering():
     """Descriptors of this process whose close may wait."""
     found = []
     for fd in (int(one.name) for one in Path("/proc/self/fd").iterdir()):
@@ -47,7 +45,7 @@ def lingering() -> list[int]:
     return found
 
 
-def test_an_end_has_one_spelling() -> None:
+def test_an_end_has_one_spelling():
     """A link of IPv4 on a port of IPv6 would look like a handshake that hangs, or like a stranger."""
     ends = {
         "tcp/127.0.0.1:7447": "127.0.0.1:7447",
@@ -58,7 +56,7 @@ def test_an_end_has_one_spelling() -> None:
 
 
 @pytest.mark.parametrize("remedy", ["the link is made anew", "restart it"])
-def test_a_udp_listener_that_nobody_reads_has_failed(remedy: str) -> None:
+def test_a_udp_listener_that_nobody_reads_has_failed(remedy):
     """A ground that was stopped for some seconds would show nothing any more, and say that all else is well."""
     failures, told = Failures(time.time_ns), list[bool]()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
@@ -88,7 +86,7 @@ def test_a_udp_listener_that_nobody_reads_has_failed(remedy: str) -> None:
             assert not failures.now
 
 
-def test_no_socket_of_zenoh_lingers(free_port: int) -> None:
+def test_no_socket_of_zenoh_lingers(free_port):
     """A link that fell dark would hold one of Zenoh's few threads for ten seconds, and whoever comes back with it."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     with (
@@ -99,7 +97,7 @@ def test_no_socket_of_zenoh_lingers(free_port: int) -> None:
         eventually(lambda: not lingering())
 
 
-def test_two_sessions_of_one_process_leave_each_other_alone(free_port: int) -> None:
+def test_two_sessions_of_one_process_leave_each_other_alone(free_port):
     """Each took the other's link for a handshake that hangs, and ended it every few seconds."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     here = LinkSettings("edge", connect=(endpoint,))
@@ -114,7 +112,7 @@ def test_two_sessions_of_one_process_leave_each_other_alone(free_port: int) -> N
         assert [str(link.src) for session in (one, other) for link in session.info.links()] == before
 
 
-def test_sockets_of_a_host_program_are_left_alone(free_port: int) -> None:
+def test_sockets_of_a_host_program_are_left_alone(free_port):
     """Its connection to the port that HVT connects to would be shut down, and what it set undone."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     as_zenoh = struct.pack("ii", 1, 10)
@@ -131,12 +129,12 @@ def test_sockets_of_a_host_program_are_left_alone(free_port: int) -> None:
         assert one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(as_zenoh)) == as_zenoh
 
 
-def test_a_watch_outlives_what_goes_wrong_once(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_watch_outlives_what_goes_wrong_once(free_port, monkeypatch):
     """Without a thread to spare for a probe it ended for good, and sockets of Zenoh lingered again."""
     looks = []
     is_socket = stat.S_ISSOCK
 
-    def look(mode: int) -> bool:
+    def look(mode):
         if threading.current_thread().name == "hvt-sockets":
             looks.append(1)
             if len(looks) == 1:
@@ -148,7 +146,7 @@ def test_a_watch_outlives_what_goes_wrong_once(free_port: int, monkeypatch: pyte
         eventually(lambda: len(looks) > 1)
 
 
-def test_a_program_that_leaves_its_session_open_ends_the_watch(free_port: int) -> None:
+def test_a_program_that_leaves_its_session_open_ends_the_watch(free_port):
     """It would not end, or abort without a word: Python can end no thread that is within Zenoh, and start none."""
     code = f"""
 import atexit, threading
@@ -164,7 +162,7 @@ left.__enter__()
     assert done.stdout == "\n"
 
 
-def test_a_number_that_is_another_file_by_now_is_not_copied(tmp_path: Path) -> None:
+def test_a_number_that_is_another_file_by_now_is_not_copied(tmp_path):
     """Each such copy stayed open."""
     with (tmp_path / "file").open("wb") as file:
         before = len(list(Path("/proc/self/fd").iterdir()))
@@ -175,9 +173,7 @@ def test_a_number_that_is_another_file_by_now_is_not_copied(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("protocol", ["tcp", "tls"])
-def test_a_handshake_begun_in_darkness_is_given_up_in_light(
-    tmp_path: Path, free_port: int, protocol: str
-) -> None:
+def test_a_handshake_begun_in_darkness_is_given_up_in_light(tmp_path, free_port, protocol):
     """Behind SSH or a proxy, video would come back seconds after the line."""
     fleet = Fleet(tmp_path / "keys")
     fleet.keys("add-edge", "uav-1")
@@ -199,9 +195,7 @@ def test_a_handshake_begun_in_darkness_is_given_up_in_light(
         eventually(edge.info.links, what="a link again")
 
 
-def test_a_name_whose_first_address_is_dark_has_others(
-    tmp_path: Path, free_port: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_whose_first_address_is_dark_has_others(tmp_path, free_port, monkeypatch):
     """With an IPv6 address that no packet reaches, an edge never came to the IPv4 address of the same name."""
     file = tmp_path / "link.json5"
     file.write_text(json.dumps({"transport": {"unicast": {"open_timeout": 1_000_000}}}))
@@ -218,7 +212,7 @@ def test_a_name_whose_first_address_is_dark_has_others(
         eventually(lambda: ended)
 
 
-def test_who_answers_slowly_is_waited_for(tmp_path: Path, free_port: int) -> None:
+def test_who_answers_slowly_is_waited_for(tmp_path, free_port):
     """A handshake that is long because the other side is would be cut short each time, and no link ever come."""
     slow_s = 2.25
     file = tmp_path / "link.json5"
@@ -226,7 +220,7 @@ def test_who_answers_slowly_is_waited_for(tmp_path: Path, free_port: int) -> Non
     file.write_text(json.dumps({"connect": {"retry": retry}}))
     with socket.create_server(("127.0.0.1", 0)) as door:
 
-        def greet(one: socket.socket) -> None:
+        def greet(one):
             with one, suppress(OSError):
                 first = one.recv(4096)
                 if len(first) == PROBE_BYTES:
@@ -239,12 +233,12 @@ def test_who_answers_slowly_is_waited_for(tmp_path: Path, free_port: int) -> Non
                     back.start()
                     pump(one, other)
 
-        def pump(one: socket.socket, other: socket.socket) -> None:
+        def pump(one, other):
             with suppress(OSError):
                 while data := one.recv(4096):
                     other.sendall(data)
 
-        def serve() -> None:
+        def serve():
             with suppress(OSError):
                 while True:
                     threading.Thread(target=greet, args=[door.accept()[0]], daemon=True).start()

@@ -1,7 +1,5 @@
 """What a decoded picture shows of a crop, in whole numbers."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 from typing import Any
@@ -13,7 +11,7 @@ from hypothesis import strategies as st
 
 from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop, exact_base_crop
-from hvt_common.video.hevc import BaseDecoder, YuvPicture
+from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import psnr_y_db
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
@@ -23,7 +21,7 @@ SIZE = (320, 192)
 
 
 @pytest.fixture(scope="module")
-def picture() -> YuvPicture:
+def picture():
     """As the decoder gives it."""
     image = textured(*SIZE, seed=2)
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=10, bitrate_bps=2_000_000))
@@ -53,19 +51,13 @@ def test_it_is_the_picture_of_that_place(picture, view, crop, size):
     assert psnr_y_db(exact, usual) > psnr_y_db(exact, aside)
 
 
-def slowly(
-    planes: tuple[np.ndarray, ...],
-    view: View,
-    crop: tuple[int, int, int, int],
-    size: tuple[int, int],
-    place: tuple[int, int],
-) -> list[int]:
+def slowly(planes, view, crop, size, place):
     """One pixel, B, G, R, as docs/wire-stills.md states it, in Python's whole numbers."""
 
-    def fixed(value: float) -> int:
+    def fixed(value):
         return math.floor(value * 65536 + 0.5)
 
-    def taps(origin: int, step: int, i: int, length: int) -> tuple[list[tuple[int, int]], int]:
+    def taps(origin, step, i, length):
         n = max(1, -(-step // 65536))
         found = []
         for j in range(i * n, (i + 1) * n):

@@ -1,7 +1,5 @@
 """The quality of a still is searched for: the best that fits, and the least that is good enough."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -89,22 +87,13 @@ def test_a_search_takes_few_tries_and_none_twice(name, target_db):
     assert len(set(tried)) == len(tried)
 
 
-def test_what_cannot_be_had_is_none():
-    """The edge would send a still that is too large, or not good enough, without knowing."""
+def test_what_cannot_be_had_is_none_and_the_bounds_are_kept():
+    """A still would be sent that breaks the budget, or is worse than the method's floor."""
     codec = still_codec("jpeg")
     assert best_fitting(codec, CROP, limit_bytes=50, **WHOLE) is None
     assert smallest_reaching(codec, CROP, target_db=70, **WHOLE) is None
-
-
-def test_the_bounds_are_kept():
-    """A floor or a ceiling of quality would not hold."""
-    codec = still_codec("jpeg")
-    fitting = best_fitting(codec, CROP, limit_bytes=10**6, low_pct=35, high_pct=90)
-    reaching = smallest_reaching(codec, CROP, target_db=1, low_pct=35, high_pct=90)
-    assert fitting is not None
-    assert reaching is not None
-    assert fitting[1] == 90
-    assert reaching[1] == 35
+    assert best_fitting(codec, CROP, limit_bytes=10**6, low_pct=35, high_pct=90)[1] == 90
+    assert smallest_reaching(codec, CROP, target_db=1, low_pct=35, high_pct=90)[1] == 35
     assert best_fitting(codec, CROP, limit_bytes=10**6, low_pct=60, high_pct=60)[1] == 60
 
 

@@ -1,7 +1,5 @@
 """A small still codec that builds on the base, for tests of what stands around codecs."""
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass, field
 

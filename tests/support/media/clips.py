@@ -1,7 +1,5 @@
 """Frames for the encoder and what follows it: drawn ones that are hard to code, and those of a real clip."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

@@ -1,7 +1,5 @@
 """Drawn crops for still codecs: a textured source, and what a thin base stream leaves of it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

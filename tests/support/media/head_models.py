@@ -5,8 +5,6 @@ is fed, and reports the bounding box of these pixels. So the right boxes and cla
 order, fit or form of box shows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -198,30 +196,29 @@ def _listed(graph: Graph, table: _Tensor, scores: _Tensor) -> _Tensor:
 _CLASSES = [[0.0], [1.0]]
 
 
-def _end_to_end(graph: Graph, image: _Tensor) -> _Outputs:
-    boxes, scores = graph.find(image)
-    table = graph.op("Concat", boxes, graph.column(scores), graph.const(_CLASSES), axis=1)
-    return {"output0": (graph.batch(graph.padded(table, np.zeros((98, 6)))), 1)}
+def _few(rest: Sequence[float]) -> np.ndarray:
+    """98 rows in the middle of the picture, with these behind the box."""
+    return np.tile([0.5, 0.5, 0.1, 0.1, *rest], (98, 1))
 
 
-def _nms_inside(graph: Graph, image: _Tensor) -> _Outputs:
-    boxes, scores = graph.find(image)
-    table = graph.op("Concat", boxes, graph.column(scores), graph.const(_CLASSES), axis=1)
-    return {"output0": (graph.batch(_listed(graph, table, scores)), 1)}
+def _rows(*columns: str, behind: np.ndarray | None = None, batch: bool = True) -> Callable[..., _Outputs]:
+    """A row an object: of these that are there, or with the rows ``behind`` them."""
 
+    def build(graph: Graph, image: _Tensor) -> _Outputs:
+        boxes, scores = graph.find(image)
+        made = {
+            "box": lambda: boxes,
+            "centred": lambda: graph.shares(graph.centred(boxes)),
+            "score": lambda: graph.column(scores),
+            "scores": lambda: graph.by_class(scores),
+            "class": lambda: graph.const(_CLASSES),
+            "zero": lambda: graph.const(np.zeros((_KINDS, 1))),
+        }
+        table = graph.op("Concat", *(made[one]() for one in columns), axis=1)
+        table = _listed(graph, table, scores) if behind is None else graph.padded(table, behind)
+        return {"output0": (graph.batch(table) if batch else table, 1)}
 
-def _yolov7_rows(graph: Graph, image: _Tensor) -> _Outputs:
-    boxes, scores = graph.find(image)
-    zero = graph.const(np.zeros((_KINDS, 1)))
-    table = graph.op("Concat", zero, boxes, graph.const(_CLASSES), graph.column(scores), axis=1)
-    return {"output": (_listed(graph, table, scores), 1)}
-
-
-def _nas_rows(graph: Graph, image: _Tensor) -> _Outputs:
-    boxes, scores = graph.find(image)
-    zero = graph.const(np.zeros((_KINDS, 1)))
-    table = graph.op("Concat", zero, boxes, graph.column(scores), graph.const(_CLASSES), axis=1)
-    return {"output": (_listed(graph, table, scores), 1)}
+    return build
 
 
 def _yolo_nas(graph: Graph, image: _Tensor) -> _Outputs:
@@ -254,23 +251,6 @@ def _rt_detr(graph: Graph, image: _Tensor) -> _Outputs:
         "pred_logits": (graph.batch(graph.padded(logits, np.full((98, _KINDS), -6.0))), 1),
         "pred_boxes": (graph.batch(graph.padded(graph.shares(graph.centred(boxes)), rest)), 1),
     }
-
-
-def _rt_detr_six(graph: Graph, image: _Tensor) -> _Outputs:
-    boxes, scores = graph.find(image)
-    centred = graph.shares(graph.centred(boxes))
-    table = graph.op("Concat", centred, graph.column(scores), graph.const(_CLASSES), axis=1)
-    rest = np.hstack(
-        [np.full((98, 2), 0.5), np.full((98, 2), 0.1), np.full((98, 1), _WEAK), np.zeros((98, 1))]
-    )
-    return {"output0": (graph.batch(graph.padded(table, rest)), 1)}
-
-
-def _rt_detr_scores(graph: Graph, image: _Tensor) -> _Outputs:
-    boxes, scores = graph.find(image)
-    table = graph.op("Concat", graph.shares(graph.centred(boxes)), graph.by_class(scores), axis=1)
-    rest = np.hstack([np.full((98, 2), 0.5), np.full((98, 2), 0.1), np.full((98, _KINDS), _WEAK)])
-    return {"output0": (graph.batch(graph.padded(table, rest)), 1)}
 
 
 def _deployed(graph: Graph, image: _Tensor) -> _Outputs:
@@ -312,13 +292,6 @@ def _tf_lists(graph: Graph, image: _Tensor) -> _Outputs:
     }
 
 
-def _padded_rows(graph: Graph, image: _Tensor) -> _Outputs:
-    """Behind the end of the list all is -1."""
-    boxes, scores = graph.find(image)
-    table = graph.op("Concat", boxes, graph.column(scores), graph.const([[0.0], [1.0]]), axis=1)
-    return {"output0": (graph.batch(graph.padded(table, np.full((98, 6), -1.0, np.float32))), 1)}
-
-
 def _padded_lists(graph: Graph, image: _Tensor) -> _Outputs:
     """Likewise, with a count that says more than there is."""
     boxes, scores = graph.find(image)
@@ -352,21 +325,21 @@ FAMILIES: Mapping[str, tuple[str, Callable[[Graph, _Tensor], _Outputs]]] = {
     "yolov8, relative": ("yolov8", _relative),
     "yolov8, transposed": ("yolov8-rows", _with_cells(objectness=None)),
     "yolov9, both branches": ("yolov8", _yolov9),
-    "yolov10": ("end-to-end", _end_to_end),
-    "NMS inside": ("end-to-end", _nms_inside),
-    "yolov7, NMS inside": ("yolov7-rows", _yolov7_rows),
+    "yolov10": ("end-to-end", _rows("box", "score", "class", behind=np.zeros((98, 6)))),
+    "NMS inside": ("end-to-end", _rows("box", "score", "class")),
+    "yolov7, NMS inside": ("yolov7-rows", _rows("zero", "box", "class", "score", batch=False)),
     "yolo-nas": ("yolo-nas", _yolo_nas),
-    "yolo-nas, NMS inside": ("nas-rows", _nas_rows),
+    "yolo-nas, NMS inside": ("nas-rows", _rows("zero", "box", "score", "class", batch=False)),
     "TensorRT's NMS": ("nms-lists", _nms_lists),
     "rt-detr": ("rt-detr", _rt_detr),
-    "rt-detr, rows of six": ("rt-detr-rows", _rt_detr_six),
-    "rt-detr, a score a class": ("rt-detr-rows", _rt_detr_scores),
+    "rt-detr, rows of six": ("rt-detr-rows", _rows("centred", "score", "class", behind=_few([_WEAK, 0]))),
+    "rt-detr, a score a class": ("rt-detr-rows", _rows("centred", "scores", behind=_few([_WEAK] * _KINDS))),
     "d-fine, deployed": ("labels-boxes-scores", _deployed),
     "ssd": ("ssd", _ssd),
     "atss": ("atss", _atss),
     "tensorflow": ("tf-lists", _tf_lists),
     "tensorflow, eight outputs": ("tf-lists", _tf_eight),
-    "NMS inside, -1 behind": ("end-to-end", _padded_rows),
+    "NMS inside, -1 behind": ("end-to-end", _rows("box", "score", "class", behind=np.full((98, 6), -1.0))),
     "TensorRT's NMS, -1 behind": ("nms-lists", _padded_lists),
 }
 """By what a user calls it: the head that it has, and what builds it."""

@@ -1,7 +1,5 @@
 """HEVC as cameras write it: clips by x265 with the settings that matter to who sends them on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

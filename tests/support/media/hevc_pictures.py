@@ -1,7 +1,5 @@
 """HEVC pictures of any announced size, written by hand (ITU-T H.265, clause 7.3): what no encoder would make."""
 
-from __future__ import annotations
-
 from hvt_common.protocol.messages.bits import BitWriter, escaped
 
 _CHROMA_QP_OFFSET = 2

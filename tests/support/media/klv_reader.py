@@ -1,7 +1,5 @@
 """Reads MPEG-TS with KLV back, with PyAV and klvdata."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field

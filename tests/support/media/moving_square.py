@@ -1,7 +1,5 @@
 """A square that moves, coded with real encoders."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from typing import cast
 

@@ -1,7 +1,5 @@
 """Clips that say which frame is which: four known colours, a disc, and the number of the frame in bits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path

@@ -5,8 +5,6 @@ mean values of the three input channels, and the box is the cell. So a red squar
 that red arrived in, where it arrived.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A small moving scene as a folder of pictures: cheap to play in real time beside other processes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """A session as the ground would hand it to the recorder: real x265 access units, boxes, stills, traffic."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """A package as a third party would install it, with still codecs, detectors or encoders behind the entry point."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The golden flights, of real processes, and what is flown once in a run of all tests, whoever comes first."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pickle

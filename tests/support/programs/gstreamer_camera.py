@@ -3,8 +3,6 @@
 Debian's packages have it: python3-gi gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-ugly.
 """
 
-from __future__ import annotations
-
 import signal
 import subprocess
 from types import TracebackType

@@ -1,7 +1,5 @@
 """JavaScript of the page, run by node."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A third party on the link, for tests: plain Zenoh, with nothing of HVT but the names of the keys."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

@@ -1,7 +1,5 @@
 """Starts hvt-edge and hvt-ground as real processes, for tests, and gathers what they say and leave behind."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import json
@@ -68,6 +66,12 @@ _ports = functools.cache(_Ports)
 def free_ports(number: int) -> list[int]:
     """TCP ports that nobody listens on at this moment, all different, and that no other test process picks."""
     return [_ports().free() for _ in range(number)]
+
+
+def python(code: str, *words: str, check: bool = True, **more: Any) -> subprocess.CompletedProcess[str]:
+    """A Python that runs the code with these words, to its end; what it says is text."""
+    command = [sys.executable, "-c", code, *words]
+    return subprocess.run(command, capture_output=True, text=True, check=check, **more)
 
 
 @contextmanager

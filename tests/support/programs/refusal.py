@@ -1,7 +1,5 @@
 """What a wrong input must come to: one sentence, and nothing left behind."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 

@@ -1,7 +1,5 @@
 """Reads a recording back, for tests: what a viewer would show at a frame, as plain values."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A camera that speaks RTSP (RFC 2326) over TCP, with RTCP sender reports; it can go away and come back."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct

@@ -1,7 +1,5 @@
 """A tunnel whose near end goes on accepting while the line behind it is dark, as those of SSH and of proxies do."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from contextlib import ExitStack, suppress

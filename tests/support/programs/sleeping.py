@@ -3,8 +3,6 @@
 Whatever happens on a busy machine alone, between any two calls of two threads, happens here within minutes.
 """
 
-from __future__ import annotations
-
 import random
 import runpy
 import sys

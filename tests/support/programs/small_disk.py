@@ -1,7 +1,5 @@
 """A small disk, for seeing what happens when it is full."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 from collections.abc import Iterator

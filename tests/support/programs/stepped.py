@@ -4,8 +4,6 @@
 so many seconds ahead, as if NTP had come up. The monotonic clock goes on, as on any machine.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys

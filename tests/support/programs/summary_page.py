@@ -1,7 +1,5 @@
 """The page that explains the summaries, `docs/summary.md`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What an edge sends of what it kept, as the link delivers it: objects of a real flight, cut into chunks."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A whole edge in media time, of which stills are requested at chosen frames; its link keeps all that is sent."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

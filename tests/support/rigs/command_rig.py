@@ -1,7 +1,5 @@
 """The side channel of an edge under its commands, frame by frame, with its real parts and a real budget."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import cv2

@@ -1,7 +1,5 @@
 """One real flight of the drawn scene into every sink, and what of it is true: flown once, read by several tests."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import socket

@@ -1,7 +1,5 @@
 """What the parts hand to each other, of a car: a new field is filled in here. The wire's are in `messages`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

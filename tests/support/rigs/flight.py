@@ -1,7 +1,5 @@
 """A small real flight for the ground: access units and stills with their headers, as the link delivers them."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time
@@ -19,14 +17,7 @@ from hvt_common.inference.store import MOTION
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_common.protocol.messages import (
-    BaseHeader,
-    Feedback,
-    Flags,
-    Info,
-    RoiHeader,
-    TrackStepEncoder,
-)
+from hvt_common.protocol.messages import BaseHeader, Feedback, Flags, Info, TrackStepEncoder
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.transport.inbox import Inbox, Received
@@ -194,12 +185,7 @@ def pipeline_of(
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     return Pipeline(
-        parts,
-        view=view,
-        fps=15,
-        detect_every=detect_every,
-        detect_still_every=detect_still_every,
-        emit=emit,
+        parts, view=view, fps=15, detect_every=detect_every, detect_still_every=detect_still_every, emit=emit
     )
 
 
@@ -284,25 +270,21 @@ class Flight:
         if data is None:
             pixels = self.pictures[index][crop[1] : crop[3], crop[0] : crop[2]]
             data = cv2.imencode(".jpg", pixels)[1].tobytes()
-        fields: dict[str, Any] = {
-            "session_id": self.session_id,
-            "sequence": sequence,
-            "frame_index": index,
-            "capture_ns": self.units[index].capture_ns,
-            "send_delay_ns": 30_000_000,
-            "flags": 0,
-            "track_id": 1,
-            "box_source_px": (x1, y1, x2, y2),
-            "crop_source_px": crop,
-            "class_name": "car",
-            "confidence": 0.5,
-            "reason": "utility",
-            "codec": "jpeg",
-            "quality_pct": 65,
-            "parameters": {},
-            "also": (),
-        }
-        return _received("roi", data, RoiHeader(**(fields | changes)).pack(data), "image/jpeg")
+        header = replace(
+            messages.PLAIN,
+            session_id=self.session_id,
+            sequence=sequence,
+            frame_index=index,
+            capture_ns=self.units[index].capture_ns,
+            send_delay_ns=30_000_000,
+            track_id=1,
+            box_source_px=(x1, y1, x2, y2),
+            crop_source_px=crop,
+            class_name="car",
+            confidence=0.5,
+            reason="utility",
+        )
+        return _received("roi", data, replace(header, **changes).pack(data), "image/jpeg")
 
     def step(self, index: int, listed: dict[int, tuple[float, float, float, float]], **changes) -> Received:
         """What the edge tracked at a frame, ``{track id: box}``: all cars at 0.8."""

@@ -1,7 +1,5 @@
 """How much memory an object holds: what a flood must not make grow, whatever the object keeps it in."""
 
-from __future__ import annotations
-
 import gc
 import sys
 from types import FunctionType, ModuleType

@@ -1,7 +1,5 @@
 """What a test of the receiving thread can wait for, however slow the machine is: all is handled, and it has ended."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The frame loop's stages of an edge with a store, and a link that goes and comes, with a ground at its other end."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """Things for an edge's store: real access units, stills as they are kept, and a folder to put them in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +10,7 @@ from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, hard_pictures
 from rigs.flight import Flight
-from rigs.messages import ROI
+from rigs.messages import PLAIN
 
 SIZE = (320, 192)
 S = 1_000_000_000
@@ -55,7 +53,7 @@ def opened(
 def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int = 7) -> bytes:
     """A still as it is kept."""
     header = replace(
-        ROI,
+        PLAIN,
         session_id=session_id,
         sequence=number,
         frame_index=3,
@@ -64,8 +62,6 @@ def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int =
         track_id=1,
         box_source_px=(10.0, 10.0, 42.0, 42.0),
         crop_source_px=(6, 6, 46, 46),
-        parameters={},
-        also=(),
     )
     return pack_backlog_still(BacklogStill(header.pack(data), "image/jpeg", data))
 

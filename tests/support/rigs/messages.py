@@ -1,7 +1,5 @@
 """One example of every message of the wire: a new field is filled in here, and nowhere else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -167,28 +165,13 @@ INFO = Info(
     still_codecs=("residual", "h264-intra"),
     channels=("base", "roi", "tracks", "status"),
 )
-_SILENT = Feedback(
-    session_id=7,
-    receiver_id=1,
-    sequence=0,
-    send_ns=1,
-    last_frame_index=-1,
-    base_messages=0,
-    base_bytes=0,
-    roi_messages=0,
-    roi_bytes=0,
-    lost=0,
-    corrupt=0,
-    base_sequence=-1,
-    base_held_us=0,
-    still_sequence=-1,
-    missing_stills=(),
-    delay_p50_ms=-1.0,
-    clock_offset_ns=0,
-    clock_error_ns=-1,
-    stills=(),
-    backlog=(),
+_COUNTED: Any = dict.fromkeys(
+    ("base_messages", "base_bytes", "roi_messages", "roi_bytes", "lost", "corrupt", "base_held_us"), 0
 )
+_NONE_YET: Any = dict.fromkeys(("last_frame_index", "base_sequence", "still_sequence", "clock_error_ns"), -1)
+_NOTHING: Any = dict.fromkeys(("missing_stills", "stills", "backlog"), ())
+_BEGUN: Any = {"session_id": 7, "receiver_id": 1, "sequence": 0, "send_ns": 1}
+_SILENT = Feedback(**_BEGUN, **_COUNTED, **_NONE_YET, **_NOTHING, delay_p50_ms=-1.0, clock_offset_ns=0)
 RESULT = StillResult(
     still_sequence=4,
     track_id=57,

@@ -38,6 +38,12 @@ def asked(address: str, path: str) -> tuple[int, str]:
         return 0, ""
 
 
+def metrics(address: str) -> str:
+    """What ``/metrics`` says; empty while that is no number, as on a machine so busy that the program stands."""
+    code, text = asked(address, "/metrics")
+    return text if code == 200 else ""
+
+
 def state(address: str) -> dict[str, Any]:
     """The newest; empty while there is none."""
     code, text = asked(address, "/state.json")
@@ -87,12 +93,7 @@ class Told:
     @classmethod
     def by(cls, address: str) -> Told:
         """All of it."""
-        return cls(
-            state(address),
-            asked(address, "/metrics")[1],
-            asked(address, "/healthz"),
-            asked(address, "/readyz"),
-        )
+        return cls(state(address), metrics(address), asked(address, "/healthz"), asked(address, "/readyz"))
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ def fly_watched(folder: Path, scene: Path) -> WatchedFlight:
         wanted, seen = asked_metrics() - MAY_LACK, []
 
         def flies() -> bool:
-            flying, there = Told.by(at_edge), asked(at_ground, "/metrics")[1]
+            flying, there = Told.by(at_edge), metrics(at_ground)
             seen[:] = [(flying, there)]  # what is told now may be gone in a moment
             has_frames = series(flying.metrics).get("hvt_edge_frames_encoded_total", 0) > 10
             return has_frames and wanted <= with_value(flying.metrics + there)

@@ -1,7 +1,5 @@
 """Real parts of an edge, put together as in flight; a test says only what it is about."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

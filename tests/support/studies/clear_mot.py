@@ -1,7 +1,5 @@
 """CLEAR MOT and IDF1 for tests: the study's own (`hvt_study.metrics.tracking`), for tracks by frame."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hvt_study.metrics.tracking import TrackingScore, compare_tracks

@@ -1,7 +1,5 @@
 """Small datasets in the real layouts, with drawn pictures: a red square that moves seven pixels a frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

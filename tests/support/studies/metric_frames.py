@@ -1,7 +1,5 @@
 """Labels and views written as rows, for tests of metrics."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hvt_study.datasets.labels import NO_ID, FrameLabels

@@ -1,7 +1,5 @@
 """Small folders in the layouts of the three public sets that the embedded models learn from."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A real study that takes seconds: coloured squares in VisDrone's layout, and ``hvt-study`` as a process."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

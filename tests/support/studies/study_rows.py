@@ -1,7 +1,5 @@
 """Rows of a study's table as tests need them: short, and with figures that can be worked out by hand."""
 
-from __future__ import annotations
-
 import json
 
 from hvt_study.report.data.document import Table

@@ -1,16 +1,12 @@
 """Opening ONNX files that come from anywhere."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import resource
-import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -25,26 +21,27 @@ from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.model_file import MAX_MODEL_BYTES, ir_metadata
 from hvt_common.runtime.process import with_lower_priority
 from media.onnx_models import colour_detector, constant_model
+from programs.processes import python
+
+ONE_THREAD = ModelSettings(threads=1)
 
 
-def test_a_model_says_its_ports_and_metadata_and_runs(tmp_path: Path) -> None:
-    """Without this nothing that detects or classifies can be opened."""
-    model = open_model(
-        constant_model(tmp_path / "m.onnx", np.ones((1, 2)), np.zeros((1, 3)), metadata={"names": "[]"}),
-        settings=ModelSettings(threads=1),
-    )
+def test_a_model_says_its_ports_and_metadata_and_runs(tmp_path):
+    """No head could be told; an input of another shape would be a traceback."""
+    path = constant_model(tmp_path / "m.onnx", np.ones((1, 2)), np.zeros((1, 3)), metadata={"names": "[]"})
+    model = open_model(path, settings=ONE_THREAD)
     assert [(port.name, port.shape) for port in model.outputs] == [("output0", (1, 2)), ("output1", (1, 3))]
-    assert model.inputs[0].shape == (1, 3, 64, 64)
-    assert model.inputs[0].dtype == np.float32
+    assert (model.inputs[0].shape, model.inputs[0].dtype) == ((1, 3, 64, 64), np.float32)
     assert model.metadata == {"names": "[]"}
     first, second = model.run(np.zeros((1, 3, 64, 64), np.float32))
-    assert first.tolist() == [[1, 1]]
-    assert second.shape == (1, 3)
+    assert (first.tolist(), second.shape) == ([[1, 1]], (1, 3))
+    with pytest.raises(UserError, match="does not run on a 1x3x32x32 input"):
+        model.run(np.zeros((1, 3, 32, 32), np.float32))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it is about Linux's niceness")
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_network_runs_below_everything_else(tmp_path: Path, threads: int) -> None:
+def test_a_network_runs_below_everything_else(tmp_path, threads):
     """Video would wait for it, or for whoever waits for it with the interpreter's lock in hand."""
     others = {one.name for one in Path("/proc/self/task").iterdir()}
     own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -62,7 +59,7 @@ def test_a_network_runs_below_everything_else(tmp_path: Path, threads: int) -> N
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == own
 
 
-def test_a_network_of_a_study_gives_way_to_nobody(tmp_path: Path) -> None:
+def test_a_network_of_a_study_gives_way_to_nobody(tmp_path):
     """A study beside any other program would stand still, though nobody waits for video there."""
     before = threading.active_count()
     open_model(colour_detector(tmp_path / "m.onnx", "yolox", size=None)).run(
@@ -71,57 +68,47 @@ def test_a_network_of_a_study_gives_way_to_nobody(tmp_path: Path) -> None:
     assert threading.active_count() <= before
 
 
-def test_what_is_no_model_is_refused_in_one_sentence(tmp_path: Path) -> None:
-    """A user who mistypes a path would read a traceback of onnxruntime."""
-    good = constant_model(tmp_path / "good.onnx", np.ones((1, 2))).read_bytes()
-    files = {
-        "text.onnx": b"not a model at all, but words\n",
-        "empty.onnx": b"",
-        "short.onnx": good[:-40],
-        "longer.onnx": good + b"\xff\xff",
-        "picture.onnx": b"\x89PNG\r\n\x1a\n" + bytes(100),
-        "head.onnx": b"\x08\x07\x12\x07pytorch",
-    }
-    for name, content in files.items():
-        (tmp_path / name).write_bytes(content)
-    for name in (*files, "missing.onnx", "."):
-        with pytest.raises(UserError) as caught:
-            open_model(tmp_path / name)
-        assert str(tmp_path / name) in str(caught.value)
-        assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
-    ("begin", "words"),
+    ("content", "words"),
     [
-        (b"version https://git-lfs.github.com/spec/v1\noid", "but Git LFS's pointer"),
-        (b"\n<!DOCTYPE html>", "but a web page"),
-        (b"PK\x03\x04\x14\0", "but a zip archive"),
-        (b"\x1c\0\0\0TFL3", "but TensorFlow Lite's"),
+        (lambda _good: b"not a model at all, but words\n", ""),
+        (lambda _good: b"", "it is empty"),
+        (lambda good: good[:-40], ""),
+        (lambda good: good + b"\xff\xff", ""),
+        (lambda _good: b"\x89PNG\r\n\x1a\n" + bytes(100), ""),
+        (lambda _good: b"\x08\x07\x12\x07pytorch", "no graph"),
+        (lambda _good: b"version https://git-lfs.github.com/spec/v1\noid".ljust(200, b"x"), "but Git LFS's"),
+        (lambda _good: b"\n<!DOCTYPE html>".ljust(200, b"x"), "but a web page"),
+        (lambda _good: b"PK\x03\x04\x14\0".ljust(200, b"x"), "but a zip archive"),
+        (lambda _good: b"\x1c\0\0\0TFL3".ljust(200, b"x"), "but TensorFlow Lite's"),
+        (
+            lambda _: b"\x80\x04\x95\x1d\0\0\0\0\0\0\0\x8c\x02os\x8c\x06system\x93\x8c\x04true\x85R.",
+            "is not an ONNX file",
+        ),
     ],
 )
-def test_what_was_given_in_place_of_a_model_is_named(tmp_path: Path, begin: bytes, words: str) -> None:
+def test_what_is_no_model_is_refused_in_one_sentence(tmp_path, content, words):
     """Nobody learns from a "wire type" that a download brought a page or a pointer."""
-    (tmp_path / "m.onnx").write_bytes(begin.ljust(200, b"x"))
-    with pytest.raises(UserError, match=f"m.onnx is not an ONNX file, {words}"):
-        open_model(tmp_path / "m.onnx")
+    path = constant_model(tmp_path / "m.onnx", np.ones((1, 2)))
+    path.write_bytes(content(path.read_bytes()))
+    assert words in sentence(path)
+    for path in (tmp_path / "missing.onnx", tmp_path):
+        sentence(path)
 
 
-def test_a_file_over_the_cap_is_not_even_parsed(tmp_path: Path) -> None:
-    """A wrong path to a huge file would fill the drone's memory."""
-    path = tmp_path / "huge.onnx"
-    with path.open("wb") as file:
+def test_a_file_over_the_cap_is_not_even_parsed(tmp_path):
+    """One wrong path would fill the memory."""
+    with (tmp_path / "huge.onnx").open("wb") as file:
         file.truncate(MAX_MODEL_BYTES + 1)
-    with pytest.raises(UserError, match=str(MAX_MODEL_BYTES + 1)):
-        open_model(path)
+    assert str(MAX_MODEL_BYTES + 1) in sentence(tmp_path / "huge.onnx")
 
 
-def test_a_file_is_gone_through_once_and_again_where_it_is_another(tmp_path: Path, monkeypatch) -> None:
-    """Each start would go through a model four times; or a file that was replaced would count as whole."""
+def test_a_file_is_gone_through_once_and_again_where_it_is_another(tmp_path, monkeypatch):
+    """A start would read a large model four times; or a file that was written over would be trusted."""
     path, passes = constant_model(tmp_path / "model.onnx", np.ones((1, 2))), []
     through = model_file.mmap.mmap
     monkeypatch.setattr(
-        model_file.mmap, "mmap", lambda *given, **named: passes.append(1) or through(*given, **named)
+        model_file.mmap, "mmap", lambda *given, **how: passes.append(1) or through(*given, **how)
     )
     for written_s, times in (
         (time.time() + 60, 3),
@@ -132,43 +119,24 @@ def test_a_file_is_gone_through_once_and_again_where_it_is_another(tmp_path: Pat
         for _ in range(3):
             model_file.check_onnx_file(path)
         assert len(passes) == times
-    path.write_bytes(path.read_bytes()[:-9])
-    for _ in range(2):
-        with pytest.raises(UserError, match="cut short"):
-            model_file.check_onnx_file(path)
-
-
-def test_a_file_that_was_written_over_with_its_old_time_is_another(tmp_path: Path) -> None:
-    """What ``rsync --inplace --times`` left damaged counted as whole, and ended the start with a traceback."""
-    path = constant_model(tmp_path / "model.onnx", np.ones((1, 2)))
-    os.utime(path, (1e9, 1e9))
-    model_file.check_onnx_file(path)
     before = path.stat()
     path.write_bytes(b"\xff" * before.st_size)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    with pytest.raises(UserError, match="cut short"):
-        model_file.onnx_metadata(path)
+    for check in (model_file.onnx_metadata, model_file.check_onnx_file):
+        with pytest.raises(UserError, match="cut short"):
+            check(path)
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, 10_000), place=st.integers(0, 10_000), byte=st.integers(0, 255))
-def test_damaged_models_are_refused_or_open_but_never_crash(
-    tmp_path: Path, cut: int, place: int, byte: int
-) -> None:
+def test_damaged_models_are_refused_or_open_but_never_crash(tmp_path, cut, place, byte):
     """A download that broke off, or a worn memory card, would end the process with a traceback."""
     path = tmp_path / "m.onnx"
     content = bytearray(constant_model(path, np.ones((1, 2))).read_bytes())
     content[place % len(content)] = byte
     path.write_bytes(bytes(content[: len(content) - cut % len(content)]))
     with contextlib.suppress(UserError):
-        assert open_model(path, settings=ModelSettings(threads=1)).path == path
-
-
-def test_an_input_of_the_wrong_shape_is_a_sentence(tmp_path: Path) -> None:
-    """A size that a model cannot take would end in a traceback of onnxruntime."""
-    model = open_model(constant_model(tmp_path / "m.onnx", np.ones((1, 2))))
-    with pytest.raises(UserError, match="does not run on a 1x3x32x32 input"):
-        model.run(np.zeros((1, 3, 32, 32), np.float32))
+        assert open_model(path, settings=ONE_THREAD).path == path
 
 
 @pytest.mark.parametrize(
@@ -187,9 +155,7 @@ def test_an_input_of_the_wrong_shape_is_a_sentence(tmp_path: Path) -> None:
         ({"operator": "BatchedNMS_TRT"}, r"operator BatchedNMS_TRT of TensorRT, which .* without NMS inside"),
     ],
 )
-def test_what_the_runtime_does_not_read_is_said_with_what_to_do(
-    tmp_path: Path, settings: dict[str, Any], words: str
-) -> None:
+def test_what_the_runtime_does_not_read_is_said_with_what_to_do(tmp_path, settings, words):
     """A model of a newer exporter would be refused with a line of C++."""
     value = helper.make_tensor_value_info
     domain = settings.get("domain", "")
@@ -210,7 +176,7 @@ def test_what_the_runtime_does_not_read_is_said_with_what_to_do(
     assert ".cc:" not in str(caught.value)
 
 
-def test_an_openvino_model_needs_its_weights_and_its_runtime(tmp_path: Path, monkeypatch) -> None:
+def test_an_openvino_model_needs_its_weights_and_its_runtime(tmp_path, monkeypatch):
     """Half a copy would end in a traceback of openvino, and a machine without it in none at all."""
     path = tmp_path / "net.xml"
     path.write_text("<net name='n' version='11'></net>")
@@ -229,11 +195,10 @@ def test_an_openvino_model_needs_its_weights_and_its_runtime(tmp_path: Path, mon
         open_model(path)
 
 
-ONE_THREAD = ModelSettings(threads=1)
 PORT = helper.make_tensor_value_info
 
 
-def written(path: Path, nodes, inputs, outputs, initialisers=()) -> Path:
+def written(path, nodes, inputs, outputs, initialisers=()):
     """A model file that nobody has checked."""
     graph = helper.make_graph(nodes, "prepared", inputs, outputs, list(initialisers))
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
@@ -241,7 +206,7 @@ def written(path: Path, nodes, inputs, outputs, initialisers=()) -> Path:
     return path
 
 
-def same(path: Path, *, inputs=1, outputs=1, shape=(1, 3, 8, 8)) -> Path:
+def same(path, *, inputs=1, outputs=1, shape=(1, 3, 8, 8)):
     """A model that gives back what it gets."""
     ins = [PORT(f"x{n}", TensorProto.FLOAT, shape) for n in range(inputs)]
     outs = [PORT(f"y{n}", TensorProto.FLOAT, shape) for n in range(outputs)]
@@ -251,7 +216,7 @@ def same(path: Path, *, inputs=1, outputs=1, shape=(1, 3, 8, 8)) -> Path:
     )
 
 
-def sentence(path: Path) -> str:
+def sentence(path):
     """Why it is refused."""
     with pytest.raises(UserError) as caught:
         open_model(path, settings=ONE_THREAD)
@@ -285,12 +250,12 @@ def test_a_list_among_the_outputs_is_refused(tmp_path):
 
 
 def test_a_large_picture_is_no_absurd_port(tmp_path):
-    """A detector for 4K pictures could not be used."""
-    model = open_model(same(tmp_path / "m.onnx", shape=(1, 3, 2176, 3840)), settings=ONE_THREAD)
-    assert model.inputs[0].shape == (1, 3, 2176, 3840)
+    """A network for 4K pictures would be refused."""
+    large = (1, 3, 2176, 3840)
+    assert open_model(same(tmp_path / "m.onnx", shape=large), settings=ONE_THREAD).inputs[0].shape == large
 
 
-def weight(name: str, *, location: str | None = None) -> TensorProto:
+def weight(name, *, location=None):
     """Four numbers, in the file or said to be in another."""
     if location is None:
         return numpy_helper.from_array(np.ones(4, np.float32), name)
@@ -300,7 +265,7 @@ def weight(name: str, *, location: str | None = None) -> TensorProto:
     return tensor
 
 
-def adding(folder: Path, tensor: TensorProto, *, where: str) -> Path:
+def adding(folder, tensor, *, where):
     """A model that adds a weight, which stands in one of the places that ONNX has for it."""
     port = [PORT("x", TensorProto.FLOAT, [4])], [PORT("y", TensorProto.FLOAT, [4])]
     add = helper.make_node("Add", ["x", "w"], ["y"])
@@ -338,17 +303,11 @@ def test_weights_in_the_file_itself_are_taken(tmp_path, where):
 
 
 def test_a_model_is_read_as_onnx_whatever_its_name_ends_in(tmp_path):
-    """A name would choose the parser: .ort is another format with another one."""
+    """A file called .ort would reach another parser, and a pickle be run."""
     good = constant_model(tmp_path / "good.onnx", np.ones((1, 2)))
     for name in ("renamed.ort", "renamed.pt", "renamed"):
-        path = tmp_path / name
-        path.write_bytes(good.read_bytes())
-        assert len(open_model(path, settings=ONE_THREAD).outputs) == 1
-    pickled = tmp_path / "pickle.onnx"
-    pickled.write_bytes(
-        b"\x80\x04\x95\x1d\x00\x00\x00\x00\x00\x00\x00\x8c\x02os\x8c\x06system\x93\x8c\x04true\x85R."
-    )
-    assert "is not an ONNX file" in sentence(pickled)
+        (tmp_path / name).write_bytes(good.read_bytes())
+        assert len(open_model(tmp_path / name, settings=ONE_THREAD).outputs) == 1
 
 
 def test_messages_nested_without_end_are_refused(tmp_path):
@@ -362,7 +321,7 @@ def test_messages_nested_without_end_are_refused(tmp_path):
     assert "deep" in sentence(path)
 
 
-def _varint(number: int) -> bytes:
+def _varint(number):
     data = b""
     while number > 0x7F:
         data, number = data + bytes([number & 0x7F | 0x80]), number >> 7
@@ -389,13 +348,7 @@ def test_a_constant_that_would_fill_the_memory_is_not_made_when_the_model_is_ope
         "print(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1])\n"
     )
     limit = lambda: resource.setrlimit(resource.RLIMIT_CPU, (60, 60))  # noqa: E731
-    ended = subprocess.run(
-        [sys.executable, "-c", script, str(path)],
-        capture_output=True,
-        text=True,
-        preexec_fn=limit,
-        check=True,
-    )
+    ended = python(script, str(path), preexec_fn=limit)
     assert int(ended.stdout) < 1_500_000, "kilobytes; the constant alone would have 3.6 GB"
 
 
@@ -418,7 +371,7 @@ def test_a_constant_that_would_fill_the_memory_is_not_made_when_the_model_is_ope
         ),
     ],
 )
-def test_an_openvino_model_says_its_pixels(tmp_path: Path, said: str, expected: dict[str, str]) -> None:
+def test_an_openvino_model_says_its_pixels(tmp_path, said, expected):
     """A network of Geti or DL Streamer would get other pixels than it was trained with, and find little."""
     (tmp_path / "m.bin").write_bytes(b"")
     (tmp_path / "m.xml").write_text(f"<net><rt_info><model_info>{said}</model_info></rt_info></net>")
@@ -426,10 +379,8 @@ def test_an_openvino_model_says_its_pixels(tmp_path: Path, said: str, expected: 
     assert {key: value for key, value in found.items() if key.startswith("hvt.")} == expected
 
 
-def test_a_model_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
-    """ONNX Runtime takes no such name: a traceback ended the start."""
-    name = constant_model(tmp_path / "m.onnx", np.ones((1, 2))).rename(
-        tmp_path / os.fsdecode(b"caf\xe9.onnx")
-    )
+def test_a_model_whose_name_is_not_utf_8_is_refused(tmp_path):
+    """Onnxruntime takes no such name, and says so in a TypeError."""
+    path = constant_model(tmp_path / "m.onnx", np.ones((1, 2)))
     with pytest.raises(UserError, match="its name is not UTF-8, rename it"):
-        open_model(name, settings=ModelSettings(threads=1))
+        open_model(path.rename(tmp_path / os.fsdecode(b"caf\xe9.onnx")), settings=ONE_THREAD)
