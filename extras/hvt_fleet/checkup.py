@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import UserError
-from hvt_common.runtime.reporting import Finding, say
+from hvt_common.runtime.reporting import Finding
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_fleet.link.diagnose import visit
@@ -46,7 +46,7 @@ def run_checks(
 def print_findings(title: str, findings: Mapping[str, Finding], *, as_json: bool) -> int:
     """Show them, and the remedies at the end. Returns the exit code: 2 if something is wrong."""
     if as_json:
-        say(json.dumps([{"check": name, **asdict(one)} for name, one in findings.items()]))
+        print(json.dumps([{"check": name, **asdict(one)} for name, one in findings.items()]))
     else:
         table = Table.grid(padding=(0, 2))
         for name, one in findings.items():

@@ -12,7 +12,7 @@ from hvt_common.config import checked
 from hvt_common.errors import Parser, UserError
 from hvt_common.protocol.channels import EdgeKeys
 from hvt_common.runtime.reporting import check_writable, say
-from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s
+from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s, shown_text
 from hvt_ground.control import EdgeClient, RemoteEdge, RequestedStill, check_suffix
 
 _TIMEOUT_S = 15.0
@@ -28,7 +28,7 @@ def run(argv: Sequence[str]) -> int:
         if arguments.command == "edges":
             names = edges.names()
             for name in names or [edges.nobody()]:
-                say(name)
+                print(shown_text(name))
             return 0
         do(edges[arguments.edge or _only_one(edges)])
     return 0
@@ -98,11 +98,11 @@ def _described(still: RequestedStill) -> str:
 
 def _tracks(edge: RemoteEdge) -> None:
     tracks = edge.tracks(on_note=lambda note: say(f"{edge.name}: {note}"))
-    say(f"{'track':>6}  {'class':<14} {'conf':>4}  x,y,w,h in source pixels")
+    print(f"{'track':>6}  {'class':<14} {'conf':>4}  x,y,w,h in source pixels")
     for one in tracks:
         x1, y1, x2, y2 = one.box_source_px
-        say(
-            f"{one.track_id:>6}  {one.class_name:<14} {one.confidence:>4.2f}  "
+        print(
+            f"{one.track_id:>6}  {shown_text(one.class_name):<14} {one.confidence:>4.2f}  "
             f"{x1:.0f},{y1:.0f},{x2 - x1:.0f},{y2 - y1:.0f}"
         )
 

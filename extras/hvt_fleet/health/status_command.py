@@ -18,7 +18,6 @@ from rich.table import Table
 
 from hvt_common.errors import FlightError, Parser
 from hvt_common.runtime.host_names import host_and_port
-from hvt_common.runtime.reporting import say
 from hvt_common.units import shown_text
 
 _PATIENCE_S = 5.0
@@ -47,7 +46,7 @@ class StatusCommand:
         if not arguments.watch:
             state, table = self._requested(address)
             if arguments.json:
-                say(json.dumps(state))
+                print(json.dumps(state))
             else:
                 console.print(table)
             return 0

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import socket
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -75,6 +78,15 @@ def test_only_what_is_wrong_fails_and_each_says_what_to_do(capsys):
     assert [(row["check"], row["state"]) for row in rows] == [("clock", "warning"), ("camera", "wrong")]
     assert print_findings("doctor", wrong, as_json=False) == 2
     assert "gone [really]" in capsys.readouterr().out
+
+
+def test_an_answer_that_a_full_disk_does_not_take_is_no_success(monkeypatch):
+    """The script that reads the file would take an empty one for a sound edge."""
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        monkeypatch.setattr("sys.stdout", io.TextIOWrapper(full, write_through=True))
+        with pytest.raises(OSError, match="No space left"):
+            print_findings("doctor", {"clock": Finding("ok", "set")}, as_json=True)
+        sys.stdout.detach()
 
 
 def test_ports_folders_and_the_clock(tmp_path):
