@@ -54,16 +54,13 @@ def namespaces() -> Iterator[tuple[str, str]]:
         ip("netns", "add", names[1])
         pair = ("veth-a", "netns", names[0], "type", "veth", "peer", "name", "veth-b", "netns", names[1])
         ip("link", "add", *pair)
-        for name, end, address in (
-            (names[0], "veth-a", "10.99.0.1/30"),
-            (names[1], "veth-b", "10.99.0.2/30"),
-        ):
+        ends = ("veth-a", "10.99.0.1/30"), ("veth-b", "10.99.0.2/30")
+        for name, (end, address) in zip(names, ends, strict=True):
             ip("-n", name, "address", "add", address, "dev", end)
             # No neighbour discovery of IPv6 among the counted packets.
             no_ipv6 = "echo 1 > /proc/sys/net/ipv6/conf/all/disable_ipv6"
-            subprocess.run(
-                ["ip", "netns", "exec", name, "sh", "-c", no_ipv6], check=False, capture_output=True
-            )
+            within = ["ip", "netns", "exec", name, "sh", "-c", no_ipv6]
+            subprocess.run(within, check=False, capture_output=True)
             ip("-n", name, "link", "set", "lo", "up")
             ip("-n", name, "link", "set", end, "up")
         yield names
@@ -100,11 +97,8 @@ def test_the_ledger_agrees_with_the_kernel_on_a_link(namespaces, links):
     rows = measure(namespaces, device="veth-a", host="10.99.0.2", listens_in=1, links=links)
     assert [row["size"] for row in rows] == list(SIZES)
     for row in rows:
-        assert (
-            -0.01 * row["ip_bytes"]
-            <= row["ip_bytes"] - row["ledger_bytes"]
-            <= 0.01 * row["ip_bytes"] + STRAY_BYTES
-        )
+        share = 0.01 * row["ip_bytes"]
+        assert -share <= row["ip_bytes"] - row["ledger_bytes"] <= share + STRAY_BYTES
     video = [row for row in rows if row["size"] >= 1_600]
     on_device = sum(row["device_bytes"] for row in video)
     assert on_device == pytest.approx(sum(row["ledger_bytes"] for row in video), rel=0.03)
@@ -144,17 +138,14 @@ def send(endpoint: str, device: str, links: str) -> None:
                 time.sleep(1 / 15)
             time.sleep(0.1)
             device_bytes, packets = (now - then for now, then in zip(_counters(device), before, strict=True))
-            overhead = overhead_bytes(
-                size, ATTACHMENT_BYTES, key=KEYS[Channel.BASE], encoding=DELIVERIES[Channel.BASE].encoding
-            )
-            rows.append(
-                {
-                    "size": size,
-                    "device_bytes": device_bytes,
-                    "ip_bytes": device_bytes - ETHERNET_BYTES * packets,
-                    "ledger_bytes": MESSAGES * (size + ATTACHMENT_BYTES + overhead),
-                }
-            )
+            encoding = DELIVERIES[Channel.BASE].encoding
+            overhead = overhead_bytes(size, ATTACHMENT_BYTES, key=KEYS[Channel.BASE], encoding=encoding)
+            row = {
+                "size": size,
+                "device_bytes": device_bytes,
+                "ip_bytes": device_bytes - ETHERNET_BYTES * packets,
+            }
+            rows.append(row | {"ledger_bytes": MESSAGES * (size + ATTACHMENT_BYTES + overhead)})
     print(json.dumps(rows), flush=True)
 
 

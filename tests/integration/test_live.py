@@ -80,24 +80,16 @@ def late(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
             request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
             reply = ControlAnswer.parse(answer(third, "hvt/uav-1/control", request.pack()) or b"")
             eventually(lambda: keyframes(tap, after=newest), what="a keyframe comes")
-        first = link.ground(
-            *ANALYSES, "--record", "first.rrd", "--timing", "first.csv", name="first", connects=True
-        )
+        records = ("--record", "first.rrd", "--timing", "first.csv")
+        first = link.ground(*ANALYSES, *records, name="first", connects=True)
         eventually(lambda: shown(folder / "first.csv") >= 30, what="the first ground's picture")
         first.stop()
-        second = link.ground(
-            *ANALYSES, "--record", "second.rrd", "--timing", "second.csv", "--once", name="second"
-        )
+        records = ("--record", "second.rrd", "--timing", "second.csv", "--once")
+        second = link.ground(*ANALYSES, *records, name="second")
         eventually(lambda: shown(folder / "second.csv") >= 30, what="the second ground's picture")
         edge.stop()
-        return Late(
-            keyframe_answer=reply,
-            keyframes=len(keyframes(tap, after=newest)),
-            first=first.finish(),
-            second=second.finish(),
-            edge=edge.finish(),
-            folder=folder,
-        )
+        seen_of, seen_again, sent = (one.finish() for one in (first, second, edge))
+        return Late(reply, len(keyframes(tap, after=newest)), seen_of, seen_again, sent, folder)
 
 
 def seen(tap: Tap) -> list[BaseHeader]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -48,44 +50,27 @@ def held(*words: str) -> tuple[int, str, str]:
     return found[-1]
 
 
-def patiently(edge):
-    """Its tracks, asked for ten times a second: more than 32 questions a second are refused."""
-    time.sleep(0.1)
-    return edge.tracks()
-
-
-def a_track_and_its_still(edge) -> tuple[list[EdgeTrack], RequestedStill]:
-    """The list of tracks and a still of its first; both asked for again where that track is already lost."""
-    found = []
+def patiently(ask: Callable[[], Any], *, while_says: str) -> Any:
+    """What it answers, if need be at another try: of more than 32 questions a second the edge refuses some."""
+    found: list[Any] = []
 
     def asked() -> bool:
-        tracks = patiently(edge)
+        time.sleep(0.1)
         try:
-            found.extend((tracks, edge.still(track=track.track_id)) for track in tracks[:1])
+            found.append(ask())
         except RefusedError as error:
-            if "no track" not in str(error):
+            if while_says not in str(error):
                 raise
-        return bool(found)
+        return bool(found and found[-1])
 
-    eventually(asked, what="a track lives long enough to be asked for")
-    return found[0]
+    eventually(asked, what="the edge has what is asked for")
+    return found[-1]
 
 
-def two_seconds_ago(edge):
-    """The place as it was then; asked for again while the edge has not flown for so long."""
-    found = []
-
-    def asked() -> bool:
-        try:
-            found.append(edge.still(box=PLACE, at_s=-2, quality_pct=90))
-        except RefusedError as error:
-            if "frames go back" not in str(error):
-                raise
-            time.sleep(0.2)
-        return bool(found)
-
-    eventually(asked, what="the edge has flown for two seconds")
-    return found[0]
+def first_track(edge) -> tuple[list[EdgeTrack], RequestedStill] | None:
+    """The list of tracks and a still of its first."""
+    tracks = edge.tracks()
+    return (tracks, edge.still(track=tracks[0].track_id)) if tracks else None
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +91,9 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Simple
             one = edges["uav-1"]
             names = edges.names()
             box = one.still(box=PLACE, quality_pct=90)
-            past = two_seconds_ago(one)
-            tracks, track = a_track_and_its_still(one)
+            ago = lambda: one.still(box=PLACE, at_s=-2, quality_pct=90)  # noqa: E731
+            past = patiently(ago, while_says="frames go back")  # it has not flown for so long
+            tracks, track = patiently(lambda: first_track(one), while_says="no track")  # it is lost already
             refusals = [
                 refusal(lambda: one.still(track=99999)),
                 refusal(lambda: one.still(at_s=-600)),
@@ -124,21 +110,9 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Simple
         told = held("still", *connect, "--box", "300,100,200,150", "--at", "-1s", *out)
         nobody = command("keyframe", *connect, "--edge", "uav-2")
         edge.stop()
-        return SimpleNamespace(
-            names=names,
-            box=box,
-            past=past,
-            track=track,
-            tracks=tracks,
-            refusals=refusals,
-            before_kbps=before // 1000,
-            after_kbps=after // 1000,
-            told=told,
-            nobody=nobody,
-            folder=folder,
-            edge=edge.finish(),
-            ground=ground.finish(),
-        )
+        found = {"names": names, "box": box, "past": past, "track": track, "tracks": tracks, "told": told}
+        found |= {"refusals": refusals, "kbps": (before // 1000, after // 1000), "nobody": nobody}
+        return SimpleNamespace(folder=folder, edge=edge.finish(), ground=ground.finish(), **found)
 
 
 def shows(long_scene: Path, index: int, picture: np.ndarray) -> bool:
@@ -196,7 +170,7 @@ def test_the_command_line_writes_the_picture(flight, long_scene):
 
 def test_another_budget_holds(flight):
     """What was said to the edge would have no effect."""
-    assert (flight.before_kbps, flight.after_kbps) == (500, 300)
+    assert flight.kbps == (500, 300)
 
 
 def test_both_ledgers_know_what_was_asked_for(flight):
@@ -220,8 +194,9 @@ def test_video_alone_follows_objects_once_somebody_asks_for_them(tmp_path):
             one, said, listed = edges["uav-1"], [], []
 
             def tracked() -> bool:
+                time.sleep(0.1)
                 try:
-                    listed.extend(patiently(one))
+                    listed.extend(one.tracks())
                 except RefusedError as error:
                     said.append(str(error))
                 return bool(listed)

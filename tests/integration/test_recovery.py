@@ -83,25 +83,23 @@ def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
 @pytest.mark.nightly
 def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
     """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
-    lossy = Script(
-        (Phase(0.0, LinkState(4_000_000, delay_s=0.01, loss=0.12)),), lasts_s=60.0, queue_bytes=100_000
-    )
-    ground = link.start(
-        "hvt_ground.cli",
-        ["--listen", f"udp/127.0.0.1:{link.port}", *SEES, "--record", "flight.rrd", "--timing", "timing.csv"],
-        name="ground",
-    )
+    state = LinkState(4_000_000, delay_s=0.01, loss=0.12)
+    lossy = Script((Phase(0.0, state),), lasts_s=60.0, queue_bytes=100_000)
+    records = (*SEES, "--record", "flight.rrd", "--timing", "timing.csv")
+    ground = link.start("hvt_ground.cli", ["--listen", f"udp/127.0.0.1:{link.port}", *records], name="ground")
     ground.until("listening on")
     with Relay(lossy, protocol="udp", target_port=link.port, seed=3) as relay:
-        edge = link.start(
-            "hvt_edge.cli",
-            [
-                *("--connect", f"udp/127.0.0.1:{relay.port}", *PLAYS),
-                *("--method", "M1", "--tune", "every_frames=20", "--cooldown", "0s", "--min-gain", "1"),
-                *("--gate", "60", "--video-share", "0.6", "--still-codec", "jpeg"),
-            ],
-            name="edge",
+        settings = (
+            "--connect",
+            f"udp/127.0.0.1:{relay.port}",
+            *PLAYS,
+            "--still-codec",
+            "jpeg",
+            "--cooldown",
+            "0s",
         )
+        many = ("--method", "M1", "--tune", "every_frames=20", "--min-gain", "1", "--gate", "60")
+        edge = link.start("hvt_edge.cli", [*settings, *many, "--video-share", "0.6"], name="edge")
         more_is_shown(link.folder, than=0)
         relay.begin()
 

@@ -14,7 +14,7 @@ import pytest
 from hvt_edge.backlog.entry import FIRST_STORED
 from lab.link.carriers.relay import Relay
 from lab.link.timeline import LinkState, Phase, Script
-from programs.processes import Link, eventually
+from programs.processes import Link, Running, eventually
 from programs.rrd import Recording
 from rigs.kept import INFO, opened, packed_still
 
@@ -65,6 +65,15 @@ def admitted(sent: dict[str, Any]) -> set[int]:
     return set(range(sum(live.values()))) | {FIRST_STORED + number for number in range(kept)}
 
 
+SEES = ("--detector", "motion", "--classifier", "none", "--record", "run.rrd", "--timing", "timing.csv")
+
+
+def edge_of(link: Link, relay: Relay, scene: Path, *settings: str) -> Running:
+    """An edge with a store, behind the relay."""
+    connect = ("--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), "--store-folder", "store")
+    return link.start("hvt_edge.cli", [*connect, *EDGE, *settings], name="edge")
+
+
 @pytest.mark.parametrize(
     ("dark_s", "frames"),
     [
@@ -74,19 +83,10 @@ def admitted(sent: dict[str, Any]) -> set[int]:
 )
 def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s, frames):
     """The operator would never see what the drone saw while the link was away."""
-    timing, own = tmp_path / "timing.csv", tmp_path / "own.mkv"
     script = outage(begins_s=2.0, lasts_s=dark_s)
     with Link(tmp_path, name="outage") as link, Relay(script, target_port=link.port) as relay:
-        ground = link.ground(
-            "--detector", "motion", "--classifier", "none",
-            "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),
-        )  # fmt: skip
-        edge = link.start(
-            "hvt_edge.cli",
-            ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), *EDGE,
-             "--max-frames", str(frames), "--store-folder", str(tmp_path / "store"), "--record-base", str(own)],
-            name="edge",
-        )  # fmt: skip
+        ground = link.ground(*SEES)
+        edge = edge_of(link, relay, scene, "--max-frames", str(frames), "--record-base", "own.mkv")
         # A ground that is slow to show its first picture would see no outage: the flight would be over.
         eventually(lambda: not edge.alive or relay.up.passed_bytes > 20_000, what="video goes out")
         relay.begin()
@@ -101,8 +101,10 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     shown = frames_shown(tmp_path.glob("run*.rrd"))
     first_ns = min(shown.values())
     came = sorted(round((ns - first_ns) / 1e6) for ns in shown.values())
-    assert came == times_in(own), "each frame that was coded is in the recording, at its time"
-    live, past = stills_taken(timing)
+    assert came == times_in(tmp_path / "own.mkv"), (
+        "each frame that was coded is in the recording, at its time"
+    )
+    live, past = stills_taken(tmp_path / "timing.csv")
     assert live | past == admitted(sent), "each still that was admitted, by its number"
     assert {number for number in past if number >= FIRST_STORED} or dark_s < 5
     assert sent["worst_window_bps"]["total"] <= 800_000
@@ -111,24 +113,16 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
 
 def test_an_edge_that_is_stopped_counts_what_the_ground_has(tmp_path, scene):
     """Of a stopped flight the two accounts would differ: nobody could tell a lost message from one never sent."""
-    store, timing = tmp_path / "store", tmp_path / "timing.csv"
-    with opened(store, session_id=INFO.session_id) as folder:
+    timing = tmp_path / "timing.csv"
+    with opened(tmp_path / "store", session_id=INFO.session_id) as folder:
         for number in range(400):
             data = packed_still(number, session_id=INFO.session_id)
             folder.add_still(number, data, utility=1.0, capture_ns=time.time_ns())
     slow = LinkState(rate_bps=600_000, delay_s=0.15)
     script = Script(phases=(Phase(0.0, slow),), lasts_s=200.0, queue_bytes=64_000)
     with Link(tmp_path, name="backlog") as link, Relay(script, target_port=link.port) as relay:
-        ground = link.ground(
-            "--detector", "motion", "--classifier", "none",
-            "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),
-        )  # fmt: skip
-        edge = link.start(
-            "hvt_edge.cli",
-            ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), *EDGE, "--edge-id", "uav-1",
-             "--method", "M0", "--max-frames", "30", "--store-folder", str(store)],
-            name="edge",
-        )  # fmt: skip
+        ground = link.ground(*SEES)
+        edge = edge_of(link, relay, scene, "--edge-id", "uav-1", "--method", "M0", "--max-frames", "30")
         relay.begin()
         edge.until("sending what was kept")
         eventually(

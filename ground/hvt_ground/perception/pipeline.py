@@ -20,10 +20,9 @@ from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Detections, Image, Tracks, View
+from hvt_common.values import Detections, Tracks, View
 from hvt_common.video.hevc import Picture, YuvPicture
 from hvt_ground.events import Event, Overlay, Refinement
-from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
 from hvt_ground.perception.guesses import Guesses, are_firm
 from hvt_ground.perception.history import History, as_bgr
@@ -32,9 +31,8 @@ from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
-from hvt_ground.perception.stills.vocabulary import Vocabulary
 
-__all__ = ["DecodedFrame", "PerceptionCounts", "Pipeline", "PipelineParts", "ReceivedStill"]
+__all__ = ["DecodedFrame", "PerceptionCounts", "Pipeline", "ReceivedStill"]
 
 _FARTHEST_S = 5
 """A step further ahead of all that is known is not plausible: nothing that comes after it could be shown."""
@@ -76,33 +74,6 @@ class DecodedFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class PipelineParts:
-    """The parts of one session's perception; but for the detector none of it may be shared with another."""
-
-    detector: FailingDetector
-    tracker: ByteTracker
-    reader: StillReader
-    refiner: Refiner
-    vocabulary: Vocabulary
-    """The reader's class names, and the unified names of the fused list."""
-    fusion: Fusion
-    path: CameraPath
-    """The one that ``fusion`` moves boxes by."""
-    detector_thread: DetectorThread
-    """Sessions that share the detector share it."""
-    trust: ViewTrust
-    """How far the detector can be trusted in this session's video."""
-    edge_alike: bool = False
-    """The edge's detector has our classes: it is taken for the same, which knows no view that ours does not."""
-    guesses: Guesses | None = None
-    """None where the detector's scores are no probabilities."""
-    search: ScaleSearch | None = None
-    """The search for the scale of this session's video; None where the scale is given."""
-    turns: AbstractContextManager[None] = field(default_factory=nullcontext)
-    """Around analysis and the reading of stills, which may hang."""
-
-
-@dataclass(frozen=True, slots=True)
 class PerceptionCounts:
     """The counts of a `Pipeline`; the defaults are those of one that is not made yet."""
 
@@ -131,25 +102,38 @@ class PerceptionCounts:
     """It is so low that the detector does not know the view."""
 
 
+@dataclass(eq=False, kw_only=True)
 class Pipeline:
     """One session's perception. Used by one thread; ``emit`` takes the events.
 
-    Detections are at least ``detect_every`` frames apart, up to ``detect_still_every`` while nothing changes.
+    But for the detector and its thread no part of it may be shared with another session. Detections are at least
+    ``detect_every`` frames apart, up to ``detect_still_every`` while nothing changes.
     """
 
-    def __init__(
-        self,
-        parts: PipelineParts,
-        *,
-        view: View,
-        fps: float,
-        detect_every: int,
-        detect_still_every: int = 0,
-        emit: Callable[[Event], None],
-    ) -> None:
-        self._parts = parts
-        self._detect_every, self._detect_still_every = detect_every, detect_still_every
-        self._base_size, self._scale = view.base_size, view.scale
+    detector: FailingDetector
+    detector_thread: DetectorThread
+    tracker: ByteTracker
+    reader: StillReader
+    refiner: Refiner
+    fusion: Fusion
+    trust: ViewTrust
+    """How far the detector can be trusted in this session's video."""
+    view: View
+    fps: float
+    detect_every: int
+    detect_still_every: int = 0
+    emit: Callable[[Event], None]
+    edge_alike: bool = False
+    """The edge's detector has our classes: it is taken for the same, which knows no view that ours does not."""
+    guesses: Guesses | None = None
+    """None where the detector's scores are no probabilities."""
+    search: ScaleSearch | None = None
+    """The search for the scale of this session's video; None where the scale is given."""
+    turns: AbstractContextManager[None] = field(default_factory=nullcontext)
+    """Around analysis and the reading of stills, which may hang."""
+
+    def __post_init__(self) -> None:
+        fps = self.fps
         self._frame_ns = SECOND_NS / fps
         self._turn_s = _TURN_SHARE / fps
         self._detection: Detection | None = None
@@ -159,7 +143,6 @@ class Pipeline:
         self._due_ns = 0
         """When the one that was to be searched was captured, which another may have replaced."""
         self._farthest = round(_FARTHEST_S * fps)
-        self._emit = emit
         self._pending: list[Event] = []
         """By stills, until it is known which tracks are guesses."""
         gap_frames = max(1, round(_GAP_S * fps))
@@ -170,16 +153,14 @@ class Pipeline:
             gap_frames=gap_frames,
         )
         self._stills = StillStage(
-            parts.reader,
-            parts.refiner,
-            vocabulary=parts.vocabulary,
+            self.reader,
+            self.refiner,
             history=self._history,
-            fusion=parts.fusion,
-            view=view,
+            fusion=self.fusion,
+            view=self.view,
             gap_frames=gap_frames,
             emit=self._pending.append,
         )
-        self._finer = view.scale < 1
         self._detected_frame: int | None = None
         self._now = Progress()
         self._picture_ns = 0
@@ -190,9 +171,8 @@ class Pipeline:
         self.objects_detected = -1
         """Objects that the detector showed when it last looked; -1 before the first time."""
         self._doubted = 0
-        self.trust = parts.trust
         self._steps_used = 0
-        self.tilt = parts.refiner.tilt
+        self.tilt = self.refiner.tilt
 
     @property
     def searching(self) -> bool:
@@ -203,8 +183,8 @@ class Pipeline:
     def counts(self) -> PerceptionCounts:
         return PerceptionCounts(
             tracks=self._track_ids.count,
-            refined=self._parts.refiner.tracks_refined,
-            class_changes=self._parts.refiner.class_changes,
+            refined=self.refiner.tracks_refined,
+            class_changes=self.refiner.class_changes,
             doubted=self._doubted,
             detections_run=self._detections_run,
             steps_used=self._steps_used,
@@ -223,14 +203,14 @@ class Pipeline:
         in as if it had been known at once. Without ``news``, as in lockstep, the detector is waited for.
         """
         index = picture.frame_index
-        with self._parts.turns:
+        with self.turns:
             self._history.add_frame(index, picture.picture)
             own = self._own = self._track(picture, hurry=hurry, news=news)
         self._picture_ns = picture.capture_ns
         ahead = self._now.frame_index > index
         shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
         self._now = Progress(*shown_at, picture_index=index)
-        self._parts.fusion.take_own(own)
+        self.fusion.take_own(own)
         self._show(own, picture.capture_ns)
 
     def take_late(self) -> bool:
@@ -240,8 +220,8 @@ class Pipeline:
         """
         if self._detection is not None and not self.searching:
             self._take_found(self._detection)
-            own = self._own = self._parts.tracker.extrapolated(frame_index=self._now.picture_index)
-            self._parts.fusion.take_own(own)
+            own = self._own = self.tracker.extrapolated(frame_index=self._now.picture_index)
+            self.fusion.take_own(own)
             self._track_ids.add(self._revise(own).tracks.ids.tolist())
             self._tell()
         return self.searching
@@ -262,13 +242,11 @@ class Pipeline:
         out. ``capture_ns`` is that frame's; None reckons it from the newest picture.
         """
         frame_index = step.frame_index
-        if (
-            frame_index - max(self._now.frame_index, self._now.picture_index) > self._farthest
-            or self._own is None
-        ):
+        newest = max(self._now.frame_index, self._now.picture_index)
+        if self._own is None or frame_index - newest > self._farthest:
             return
         own = self._own_at(frame_index)
-        if not self._parts.fusion.take_step(step, own=own):
+        if not self.fusion.take_step(step, own=own):
             return
         self._steps_used += 1
         if frame_index > self._now.frame_index:
@@ -281,7 +259,7 @@ class Pipeline:
 
     def read(self, stills: Sequence[ReceivedStill]) -> None:
         """Take stills, in the order in which they came; those of one frame are looked at together."""
-        with self._parts.turns:
+        with self.turns:
             self._stills.take(stills, self._now)
         self._tell()
         self._carry_merges()
@@ -293,8 +271,8 @@ class Pipeline:
         """
         if frame_index < self._now.picture_index:
             raise ValueError(f"frame {frame_index} lies before the newest frame, {self._now.picture_index}")
-        fused = self._parts.fusion.listed(self._own_at(frame_index))
-        shown = self._parts.refiner.preview(
+        fused = self.fusion.listed(self._own_at(frame_index))
+        shown = self.refiner.preview(
             fused.tracks, capture_ns=self._capture_ns(frame_index), origins=fused.origins
         )
         return self._inside(self._doubting(shown))
@@ -316,39 +294,41 @@ class Pipeline:
     # The base stream
 
     def _track(self, picture: DecodedFrame, *, hurry: bool, news: threading.Event | None) -> Tracks:
-        parts, index = self._parts, picture.frame_index
+        index = picture.frame_index
         if self._detection is not None and not self.searching:
             self._take_found(self._detection)
         begins = self._submits(picture, hurry=hurry)
-        own = parts.tracker.predict(frame_index=index, image=_gray(picture.picture), searched=begins)
-        if parts.tracker.scene_began == index:
-            parts.fusion.end_scene(index)
-        before, affine = self._now.picture_index, parts.tracker.camera_step
+        # Gray is enough to follow the camera. Only searched pictures are converted to BGR.
+        image = picture.picture.gray() if isinstance(picture.picture, YuvPicture) else picture.picture
+        own = self.tracker.predict(frame_index=index, image=image, searched=begins)
+        if self.tracker.scene_began == index:
+            self.fusion.end_scene(index)
+        before, affine = self._now.picture_index, self.tracker.camera_step
         if before >= 0 and affine is not None:  # the tracker has followed it: it is not estimated twice
-            parts.path.add(affine, start=before, end=index)
+            self.fusion.path.add(affine, start=before, end=index)
         if begins and self._detection is not None and self._is_found(self._detection, news):
             return self._take_found(self._detection)
         return own
 
     def _submits(self, picture: DecodedFrame, *, hurry: bool) -> bool:
         # Whether this picture is searched: begun here, or in place of one that has waited until now.
-        parts, last, index = self._parts, self._detected_frame, picture.frame_index
+        last, index = self._detected_frame, picture.frame_index
         if self._detection is not None:
             if not self._detection.queued or not self._detection.replace(picture.picture):
                 return False
             self._detected_frame = index
             return True
-        every = self._detect_every if parts.search is None else parts.search.interval(self._detect_every)
+        every = self.detect_every if self.search is None else self.search.interval(self.detect_every)
         every *= _PUT_OFF if hurry else 1
         due = (
             last is None
-            or parts.tracker.scene_began > last
-            or parts.tracker.is_due(index - last, every=every, most=self._detect_still_every)
+            or self.tracker.scene_began > last
+            or self.tracker.is_due(index - last, every=every, most=self.detect_still_every)
         )
         if due:
             self._detected_frame = index
             self._due_ns = picture.capture_ns
-            self._detection = parts.detector_thread.submit(picture.picture, self._detect)
+            self._detection = self.detector_thread.submit(picture.picture, self._detect)
         return due
 
     def _is_found(self, detection: Detection, news: threading.Event | None) -> bool:
@@ -365,19 +345,19 @@ class Pipeline:
 
     def _detect(self, picture: Picture) -> Detections:
         # In the detector's thread, which makes the picture's BGR: one that is replaced before needs none.
-        parts, image = self._parts, as_bgr(picture)
+        image = as_bgr(picture)
         self._detections_run += 1
-        found = parts.detector.detect(image) or Detections.none()
-        return found if parts.search is None else parts.search.take(found, image)
+        found = self.detector.detect(image) or Detections.none()
+        return found if self.search is None else self.search.take(found, image)
 
     def _take_found(self, detection: Detection) -> Tracks:
         # Takes the objects of the searched picture; our tracks there.
-        parts, self._detection = self._parts, None
+        self._detection = None
         found = detection.found.result()
         self.trust.take(found)
-        own = parts.tracker.update_late(found)
+        own = self.tracker.update_late(found)
         self.objects_detected = int((own.seen_frames == own.frame_index).sum())
-        self.tilt.take(own, parts.vocabulary.names, height_px=self._base_size[1])
+        self.tilt.take(own, self.refiner.vocabulary.names, height_px=self.view.base_size[1])
         return own
 
     def _own_at(self, frame_index: int) -> Tracks:
@@ -386,11 +366,11 @@ class Pipeline:
         if own is None:
             return Tracks.none(frame_index)
         if frame_index > own.frame_index:
-            ahead = self._parts.tracker.extrapolated(frame_index=frame_index)
+            ahead = self.tracker.extrapolated(frame_index=frame_index)
             boxes = ahead.boxes_xyxy_px.astype(np.float64)
-            moved = self._parts.path.carry(boxes, start=own.frame_index, end=frame_index)
+            moved = self.fusion.path.carry(boxes, start=own.frame_index, end=frame_index)
             return replace(ahead, boxes_xyxy_px=moved.astype(np.float32))
-        before = self._parts.fusion.own_at(frame_index)
+        before = self.fusion.own_at(frame_index)
         return Tracks.none(frame_index) if before is None else replace(before, frame_index=frame_index)
 
     def _capture_ns(self, frame_index: int) -> int:
@@ -401,7 +381,7 @@ class Pipeline:
     def _revise(self, own: Tracks) -> FusedTracks:
         # Put the list at the frame of ``own`` on record.
         self._carry_merges()
-        fused = self._parts.fusion.listed(own)
+        fused = self.fusion.listed(own)
         self._history.add_tracks(fused.tracks)
         self._stills.update(self._now)
         return fused
@@ -411,59 +391,55 @@ class Pipeline:
         fused = self._revise(own)
         self._track_ids.add(fused.tracks.ids.tolist())
         if own.frame_index > self._listed_frame:
-            step = self._parts.path.between(max(0, self._listed_frame), own.frame_index)
+            step = self.fusion.path.between(max(0, self._listed_frame), own.frame_index)
             self._listed_frame = own.frame_index
-            shown = self._parts.refiner.shown(fused.tracks, capture_ns=capture_ns, origins=fused.origins)
-            if self._parts.guesses is not None:
-                self._parts.guesses.update(fused.tracks, shown.base_classes, step, scores=fused.means)
+            shown = self.refiner.shown(fused.tracks, capture_ns=capture_ns, origins=fused.origins)
+            if self.guesses is not None:
+                self.guesses.update(fused.tracks, shown.base_classes, step, scores=fused.means)
             shown = self._doubting(shown)
             self._doubted = int(shown.doubted.sum())
             if self._detection is not None and capture_ns - self._due_ns > _LATE_NS:
                 looked_ns = self._due_ns
             self._tell()
-            self._emit(replace(self._inside(shown), looked_ns=looked_ns))
+            self.emit(replace(self._inside(shown), looked_ns=looked_ns))
         self._tell()
 
     def _tell(self) -> None:
-        pending, guesses = self._pending, self._parts.guesses
-        while pending:
-            event = pending.pop(0)
-            if guesses is not None and isinstance(event, Refinement):
-                event = guesses.doubting(event, unlike=self.trust.unlike and self._parts.edge_alike)
-            self._emit(event)
+        while self._pending:
+            event = self._pending.pop(0)
+            if self.guesses is not None and isinstance(event, Refinement):
+                event = self.guesses.doubting(event, unlike=self.trust.unlike and self.edge_alike)
+            self.emit(event)
 
     def _doubting(self, shown: Overlay) -> Overlay:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. Tracks
         # that the edge sees with another detector, or well in a finer picture, are not touched.
-        guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
+        guesses, sure, vague = self.guesses, shown.sure, shown.vague
         if guesses is None and not self.trust.unlike:
             return shown
         doubted = shown.doubted
-        firm = shown.refined & are_firm(shown.boxes_base_px, shown.confidences, scale=self._scale)
+        firm = shown.refined & are_firm(shown.boxes_base_px, shown.confidences, scale=self.view.scale)
         if guesses is not None:
             doubted = doubted | guesses.among(shown.track_ids) & ~firm
             vague = vague & ~guesses.agreed(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
         if self.trust.unlike:
             ours = np.array([one == "base" for one in shown.origins], np.bool_)
-            if self._parts.edge_alike:
-                ours = ours | (shown.confidences < (_SURE_OF_SOURCE if self._finer else math.inf))
+            if self.edge_alike:
+                ours = ours | (shown.confidences < (_SURE_OF_SOURCE if self.view.scale < 1 else math.inf))
             doubted = doubted | ours & ~firm
             sure = np.zeros_like(sure)
         return replace(shown, doubted=doubted, sure=sure, vague=vague)
 
     def _inside(self, shown: Overlay) -> Overlay:
         # The tracker lets boxes leave the picture.
-        boxes = np.clip(shown.boxes_base_px, 0, np.array([*self._base_size, *self._base_size], np.float32))
+        boxes = np.clip(
+            shown.boxes_base_px, 0, np.array([*self.view.base_size, *self.view.base_size], np.float32)
+        )
         rows = np.flatnonzero(areas(boxes) > _LEAST_INSIDE * areas(shown.boxes_base_px))
         shown = replace(shown, boxes_base_px=boxes)
         return shown if len(rows) == len(boxes) else shown.take(rows)
 
     def _carry_merges(self) -> None:
-        for survivor_id, merged_id in self._parts.fusion.take_merged():
-            self._parts.refiner.merge(survivor_id, merged_id)
+        for survivor_id, merged_id in self.fusion.take_merged():
+            self.refiner.merge(survivor_id, merged_id)
             self._history.rename_track(survivor_id, merged_id)
-
-
-def _gray(picture: Picture) -> Image:
-    # Gray is enough to follow the camera. Only searched pictures are converted to BGR.
-    return picture.gray() if isinstance(picture, YuvPicture) else picture

@@ -29,7 +29,7 @@ from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History
 from hvt_ground.perception.models import Models
-from hvt_ground.perception.pipeline import Pipeline, PipelineParts
+from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ViewTilt
@@ -57,36 +57,29 @@ class SessionPerception:
         config, models, info = self._config, self._models, self._info
         detector, reader = self._taken()
         names, edge_classes = unified_names(detector.class_names, info.class_names)
-        vocabulary = Vocabulary(names, reader.class_names, kinds=config.refine == "replace")
-        path = CameraPath(ahead_frames=max(1, round(info.fps)))
-        parts = PipelineParts(
+        return Pipeline(
             detector=detector,
+            detector_thread=models.detector_thread,
             tracker=self._tracker(),
             reader=reader,
             refiner=Refiner(
                 cast('Literal["replace", "fuse"]', config.refine),
                 fps=info.fps,
-                vocabulary=vocabulary,
+                vocabulary=Vocabulary(names, reader.class_names, kinds=config.refine == "replace"),
                 calibrated=models.facts.stills_calibrated,
                 tilt=self.tilt,
             ),
-            vocabulary=vocabulary,
-            fusion=self._fusion(edge_classes, path),
-            path=path,
-            detector_thread=models.detector_thread,
+            fusion=self._fusion(edge_classes, CameraPath(ahead_frames=max(1, round(info.fps)))),
             trust=self._trust,
-            edge_alike=info.class_names == detector.class_names,
-            guesses=self._guesses(),
-            search=self._scale_search(detector),
-            turns=Turns(f"perception of {info.edge}", models.failures),
-        )
-        return Pipeline(
-            parts,
             view=info.view,
             fps=info.fps,
             detect_every=self._detect_every,
             detect_still_every=detect_still_every(config.detect_every, fps=info.fps),
             emit=emit,
+            edge_alike=info.class_names == detector.class_names,
+            guesses=self._guesses(),
+            search=self._scale_search(detector),
+            turns=Turns(f"perception of {info.edge}", models.failures),
         )
 
     def track(self, emit: Emit) -> Callable[[int, int, Image], None]:
@@ -140,7 +133,6 @@ class SessionPerception:
         info, guesses = self._info, self._guesses()
         detector, reader = self._taken()
         names, edge_classes = unified_names(detector.class_names, info.class_names)
-        vocabulary = Vocabulary(names, reader.class_names)
         alike = info.class_names == detector.class_names
 
         def doubting(event: Event) -> None:
@@ -150,8 +142,7 @@ class SessionPerception:
 
         stage = StillStage(
             reader,
-            Refiner("fuse", fps=info.fps, vocabulary=vocabulary, tilt=self.tilt),
-            vocabulary=vocabulary,
+            Refiner("fuse", fps=info.fps, vocabulary=Vocabulary(names, reader.class_names), tilt=self.tilt),
             history=History(),
             fusion=self._fusion(edge_classes, CameraPath(ahead_frames=1)),
             view=info.view,

@@ -52,21 +52,13 @@ Analyze = Callable[[DecodedFrame, bool, threading.Event | None], None]
 Step = Callable[[Tracks, int], None]
 """Called with the edge's tracks at one frame, and that frame's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
-
-
 Job = Generator[None, None, None]
 """Work that can wait, done step by step while nothing newer is there. An exception of a step ends this job alone; it
 is closed at its end, done or not."""
 
 
 class _Worker:
-    """Takes pictures and stills from the receiving thread, and runs their jobs.
-
-    Args:
-        analyze: takes pictures.
-        step: takes the edge's tracks.
-        read: takes stills.
-    """
+    """Takes pictures and stills from the receiving thread, and runs their jobs."""
 
     def __init__(self, analyze: Analyze, step: Step, read: Read) -> None:
         self._analyze = analyze

@@ -38,6 +38,8 @@ from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.sinks import QueuedSink, Sink
 
 _MILLION = 1_000_000
+_LINES_AT_ONCE = 60
+"""Lines in a recording's log; then one a second."""
 
 WorkerFactory = Callable[[Analyze, Step, Read], PerceptionWorker]
 
@@ -98,7 +100,8 @@ class Session:
         self._decoder = BaseDecoder(size=info.base_size)
         self.poses = SessionPoses(info.view, locator=locator)
         """Where the camera is, and where tracks are on the ground."""
-        self._log = SessionLog(self._emit, clock=clock)
+        self._lines = TokenBucket(burst=_LINES_AT_ONCE, every_ns=SECOND_NS)
+        self._lines_left_out = 0
         if worker_of is None:
             worker_of = (
                 partial(LockstepWorker, name=info.edge)
@@ -183,10 +186,16 @@ class Session:
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
 
     def note(self, level: Level, text: str, *, last: bool = False) -> None:
-        """Put a line into the recording's log, unless there is a flood of them (`SessionLog`)."""
-        self._log.note(
-            level, text, at=(max(0, self.reception.newest_index), self.reception.newest_capture_ns), last=last
-        )
+        """Put a line into the recording's log; in a flood some but the ``last`` are left out, and counted."""
+        at = max(0, self.reception.newest_index), self.reception.newest_capture_ns
+        if not (last or self._lines.take(self._clock())):
+            self._lines_left_out += 1
+            return
+        if self._lines_left_out:
+            what = f"{self._lines_left_out} lines were left out here: the edge gave rise to too many"
+            self._lines_left_out = 0
+            self._emit(Notice(*at, "warning", what))
+        self._emit(Notice(*at, level, text))
 
     def close(self) -> None:
         """Finish the queue (for a second or two) and close the sinks, each whatever the others do.
@@ -313,27 +322,3 @@ class Session:
             event = self.poses.located(event)
         for sink in self.sinks:
             sink.log(event)
-
-
-_BURST, _EVERY_NS = 60, SECOND_NS
-"""Up to 60 at once, then one a second."""
-
-
-class SessionLog:
-    """Gives out lines; in a flood of them some are left out, and counted. ``at``: frame index and capture time."""
-
-    def __init__(self, emit: Callable[[Notice], None], *, clock: Callable[[], int]) -> None:
-        self._emit, self._clock = emit, clock
-        self._bucket = TokenBucket(burst=_BURST, every_ns=_EVERY_NS)
-        self._left_out = 0
-
-    def note(self, level: Level, text: str, *, at: tuple[int, int], last: bool = False) -> None:
-        """Give out a line; one of the ``last`` is never left out."""
-        if not (last or self._bucket.take(self._clock())):
-            self._left_out += 1
-            return
-        if self._left_out:
-            what = f"{self._left_out} lines were left out here: the edge gave rise to too many"
-            self._left_out = 0
-            self._emit(Notice(*at, "warning", what))
-        self._emit(Notice(*at, level, text))

@@ -123,17 +123,13 @@ class GroundLink:
         for edge in sorted(known - self._leaving):
             served, serves = edge in self._subscribers, group.serves(edge)
             if serves and not served:
-                self._begin(edge)
+                for row in _SUBSCRIBED if self._port(edge) is not None else ():
+                    self._subscribe(edge, row, 0)
             elif served and not serves:
                 self._leave(edge)
             elif not served:
                 group.release(edge)
         group.forget(except_for=known | self._leaving)
-
-    def _begin(self, edge: str) -> None:
-        if self._port(edge) is not None:
-            for row in _SUBSCRIBED:
-                self._subscribe(edge, row, 0)
 
     def _subscribe(self, edge: str, row: Channel, number: int) -> None:
         # Make the new one first, and keep the last one: the declaration of the new may be lost on the way, while the

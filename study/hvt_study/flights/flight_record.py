@@ -34,13 +34,13 @@ class Watch:
     """Stands for a pipeline's detector on the base stream and its refiner; stills go to the detector itself."""
 
     def __init__(self, pipeline: Pipeline) -> None:
-        parts = pipeline._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
-        self._detector, self._refiner = parts.detector, parts.refiner
+        self._detector, self._refiner = pipeline.detector, pipeline.refiner
         self._found: Detections | None = None
-        self.class_names = parts.detector.class_names
+        self.class_names = pipeline.detector.class_names
         self.listed: Tracks | None = None
         """The tracks of the last list, before refinement."""
-        pipeline._parts = replace(parts, detector=self, refiner=cast("Refiner", self))  # noqa: SLF001
+        # Events say neither raw detections nor confidences without refinement.
+        pipeline.detector, pipeline.refiner = self, cast("Refiner", self)
 
     def detect(self, image_bgr: Image) -> Detections | None:
         self._found = self._detector.detect(image_bgr)

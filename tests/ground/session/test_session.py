@@ -133,16 +133,10 @@ def test_a_picture_that_the_link_lost_is_asked_for_at_once_and_shown_in_its_turn
 def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
     """The operator would not see all there is; or the two sides' accounts would differ."""
     with Rig(flight) as rig:
-        items = [
-            *bases(flight, *range(30)),
-            flight.still(4, 0),
-            flight.still(9, 1),
-            flight.status(base=30, roi=2),
-        ]
-        rig.take(*items)
-        session = rig.receiver.session
-        assert (session.reception.frames, session.frames_decoded) == (30, 30)
-        assert session.reception.stills == 2
+        stills = [flight.still(4, 0), flight.still(9, 1)]
+        rig.take(*(items := [*bases(flight, *range(30)), *stills, flight.status(base=30, roi=2)]))
+        session = rig.session
+        assert (rig.decoded, session.reception.stills) == ((30, 30), 2)
         assert session.reception.duration_s == pytest.approx(2.0)
         assert session.reception.ledger.line_bytes == line_bytes(items)
         assert session.perceived.tracks >= 1
@@ -151,10 +145,8 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
         assert (last.base_messages, last.roi_messages, last.lost, last.corrupt) == (30, 2, 0, 0)
         assert last.session_id == flight.session_id
         results = [one for report in rig.port.reports for one in report.stills]
-        assert [(one.still_sequence, one.class_name, one.track_id) for one in results] == [
-            (0, "bus", 1),
-            (1, "bus", 1),
-        ]
+        said = [(one.still_sequence, one.class_name, one.track_id) for one in results]
+        assert said == [(0, "bus", 1), (1, "bus", 1)]
         assert rig.port.keyframe_requests == 0
 
 
@@ -169,7 +161,7 @@ def test_the_edges_tracks_are_counted_and_shown(pace):
         items += bases(flight, *range(12, 20))
         for item in items:
             rig.take(item)
-        session = rig.receiver.session
+        session = rig.session
         assert (session.reception.steps, session.reception.ledger.messages(Account.META)) == (3, 3)
         assert session.reception.ledger.line_bytes == line_bytes(items)
         assert session.perceived.tracks == 2
@@ -185,7 +177,7 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         rig.put(*bases(flight, 0, 1, 2, 3), good[0], good[0])
         rig.put(flight.step(4, {31: square_box(4)}, boxes=b"\xff" * 40, reference=-1))
         rig.take(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
-        session = rig.receiver.session
+        session = rig.session
         assert (session.reception.steps, session.pipeline.counts.steps_used) == (2, 1)
         assert rig.receiver.receiver.unusable == 3
         rig.take(*bases(flight, *range(4, 10)), flight.status(base=10))
@@ -196,7 +188,7 @@ def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
     """One lost message would freeze the picture, or fill it with garbage that looks like a picture."""
     with Rig(flight) as rig:
         rig.take(*bases(flight, 0, 1, 2, *range(5, 14)))
-        session = rig.receiver.session
+        session = rig.session
         assert session.frames_decoded == 3
         eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.take(*bases(flight, *range(14, 30)))
@@ -223,7 +215,7 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         rig.put(*bases(flight, 0, 1, 2, 1, 0), nonsense, other, later)
         rig.put(flight.still(1, 0), flight.still(1, 0), stranger.still(0, 5), *bases(stranger, 1))
         rig.take(status := flight.status(base=3, roi=1), status)
-        session = rig.receiver.session
+        session = rig.session
         assert (session.reception.frames, session.frames_decoded, session.reception.stills) == (3, 3, 1)
         assert session.reception.ledger.messages(Account.META) == 1
         assert rig.receiver.receiver.unusable == 4
@@ -283,22 +275,18 @@ def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
     item = flight.still(1, 0)
     with Rig(flight) as rig:
         rig.take(*bases(flight, 0, 1, 2))
-        session = rig.receiver.session
-        before = session.reception.ledger.line_bytes
-        later = flight.still(1, 0, send_delay_ns=1_030_000_000)
+        ledger = rig.session.reception.ledger
+        before, later = ledger.line_bytes, flight.still(1, 0, send_delay_ns=1_030_000_000)
         for one, copies in (
             (item, 1),
             (item, 1),
             (later, 2),
             (later, 2),
-        ):  # repeated, somebody else's, not the edge's
+        ):  # repeated: somebody else's, not the edge's
             rig.take(one)
-            assert session.reception.ledger.messages(Account.ROI) == copies
-            assert session.reception.ledger.line_bytes - before == pytest.approx(
-                copies * line_bytes([item]), abs=8
-            )
-        assert session.reception.stills == 1
-        assert session.reception.ledger.outcomes("received") == {"utility": 1}
+            assert ledger.messages(Account.ROI) == copies
+            assert ledger.line_bytes - before == pytest.approx(copies * line_bytes([item]), abs=8)
+        assert (rig.session.reception.stills, ledger.outcomes("received")) == (1, {"utility": 1})
         results = [one for report in rig.port.reports for one in report.stills]
         assert [one.still_sequence for one in results] == [0]
 
@@ -315,19 +303,14 @@ def test_a_second_edge_of_one_id_is_told_of_and_not_shown(flight, caplog):
                 items += other.base(index - 1), other.still(index, index), other.status(base=index)
             rig.take(*(replace(item, received_ns=now_ns) for item in items))
             now_ns += 66_000_000
-        assert rig.opened == [session := rig.receiver.session]
-        assert session.info.session_id == flight.session_id
-        assert (session.frames_decoded, session.reception.stills, session.reception.last_status) == (
-            30,
-            0,
-            None,
-        )
+        (session,) = rig.opened
+        assert (session, session.info.session_id) == (rig.session, flight.session_id)
+        reception = session.reception
+        assert (session.frames_decoded, reception.stills, reception.last_status) == (30, 0, None)
         assert rig.port.keyframe_requests == 0
-    said = [one.getMessage() for one in caplog.records if text in one.getMessage()]
-    assert len(said) == 1
-    assert f"{flight.session_id:08x} is shown" in said[0]
-    assert f"{other.session_id:08x} is not" in said[0]
-    assert "--edge-id" in said[0]
+    (said,) = (text_of for text_of in caplog.messages if text in text_of)
+    shown, hidden = f"{flight.session_id:08x} is shown", f"{other.session_id:08x} is not"
+    assert all(one in said for one in (shown, hidden, "--edge-id"))
     assert len(caplog.records) <= 7, "a drone's whole flight would be in the log, message by message"
 
 
@@ -415,7 +398,7 @@ def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
         rig.take(flight.still(0, 0), other.still(0, 0))
         assert rig.receiver.receiver.unusable == 0
         rig.take(*bases(flight, *range(6)))
-        session = rig.receiver.session
+        session = rig.session
         assert (session.reception.stills, session.reception.frames) == (1, 6)
         assert session.reception.ledger.messages(Account.ROI) == 1
         assert rig.receiver.receiver.unusable == 1, "the other one's"
@@ -452,7 +435,7 @@ def test_poses_that_come_before_their_session_is_open_are_taken(flight):
     with Rig(flight) as rig:
         rig.take(pose(0, encoder), pose(1, encoder), pose(0, of_another))
         rig.take(*bases(flight, *range(6)), pose(2, encoder))
-        session = rig.receiver.session
+        session = rig.session
         assert session.reception.ledger.messages(Account.META) == 3
         assert session.poses.has_pose
         assert rig.receiver.receiver.unusable == 0
@@ -483,9 +466,8 @@ def test_video_that_this_ground_does_not_read_is_told_of_in_a_sentence(flight, c
             rig.take(flight.base(index))
         assert rig.receiver.idle
         assert (rig.port.requested, rig.port.keyframe_requests) == (1, 0)
-    said = [one.getMessage() for one in caplog.records]
-    assert len(said) == 1
-    assert "the edge sends video of 'av1', and this ground reads h265: none is shown" in said[0]
+    (said,) = caplog.messages
+    assert "the edge sends video of 'av1', and this ground reads h265: none is shown" in said
 
 
 def test_a_flight_goes_on_after_an_outage(flight):
@@ -549,9 +531,8 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
 
 def test_a_still_before_its_frame_waits_for_its_track(flight):
     """On two links stills overtake pictures: they would refine nothing."""
-    with Rig(
-        flight, worker_of=partial(LockstepWorker, name="uav-1")
-    ) as rig:  # a busy machine would pass frames over
+    in_order = partial(LockstepWorker, name="uav-1")  # a busy machine would pass frames over
+    with Rig(flight, worker_of=in_order) as rig:
         rig.take(*bases(flight, 0, 1, 2), flight.still(6, 0))
         assert rig.session.perceived.refined == 0
         rig.take(*bases(flight, *range(3, 12)))
@@ -565,19 +546,17 @@ def test_lockstep_sees_every_frame_and_answers_every_still():
         flight = Flight(20, pace="lockstep")
         with Rig(flight, detector=RedSquares(takes_s=0.01)) as rig:
             for index in range(20):
-                rig.take(
-                    flight.base(index), flight.still(index, index, data=b"no jpeg" if index == 7 else None)
-                )
-            session = rig.receiver.session
+                data = b"no jpeg" if index == 7 else None
+                rig.put(flight.base(index), flight.still(index, index, data=data))
+            rig.settle()
+            session = rig.session
             assert session.perceived.detections_run == 20
             answered = [one.still_sequence for report in rig.port.reports for one in report.stills]
             assert answered == list(range(20))
             frames = [report.last_frame_index for report in rig.port.reports]
             assert frames == sorted(frames)
             assert set(range(20)) <= set(frames)
-            assert {
-                report.objects_detected for report in rig.port.reports if report.last_frame_index >= 0
-            } == {1}
+            assert {one.objects_detected for one in rig.port.reports if one.last_frame_index >= 0} == {1}
         content = summary(rig.ended[0])
         outcomes.append((content["tracks"], content["tracks_refined"], content["stills"]))
     assert outcomes[0] == outcomes[1]
@@ -586,8 +565,6 @@ def test_lockstep_sees_every_frame_and_answers_every_still():
 
 def test_another_picture_size_under_the_same_session_is_not_shown(flight):
     """A forged or broken unit would end the ground in the middle of tracking."""
-    large = Flight(3, size=(384, 256))
-    large.session_id = flight.session_id
     with Rig(flight) as rig:
         rig.take(*bases(flight, 0, 1, 2))
         forged = Flight(5, keyframes=(3,), size=(384, 256))
@@ -617,18 +594,15 @@ def test_the_summary_can_be_written_and_read():
     with Rig(flight, reader=SameAnswer(knows=False)) as rig:
         rig.take(*bases(flight, *range(10)), flight.still(2, 0), flight.still(3, 1, data=b"junk"))
     content = summary(rig.ended[0])
-    assert content["stills"]["received"] == 2
-    assert content["stills"]["unread"] == 1
-    assert content["stills"]["dropped"] == 1
+    stills = {name: content["stills"][name] for name in ("received", "unread", "dropped")}
+    assert stills == {"received": 2, "unread": 1, "dropped": 1}
     assert content["stills"]["reasons"]["outcomes"] == {"unread": 1}
     assert content["latency_ms"]["p50"] is not None
     assert content["receive_latency_ms"]["p50"] is None, "in lockstep it said 0"
     assert (content["edge"], content["method"], content["recording"]) == ("uav-1", "M5", None)
     content = completed(content, rig.receiver)
-    assert content["unusable_messages"] == 0
-    assert (content["failure"], content["failed"]) == ("", [])
-    rows = dict(table(content))
-    assert rows["frames"].startswith("10 decoded in 0.7 s, no gaps")
+    assert (content["unusable_messages"], content["failure"], content["failed"]) == (0, "", [])
+    assert dict(table(content))["frames"].startswith("10 decoded in 0.7 s, no gaps")
 
 
 def test_an_inbox_is_bounded_in_bytes():

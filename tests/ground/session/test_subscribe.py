@@ -47,39 +47,43 @@ def link(free_port: int) -> Iterator[tuple[GroundLink, zenoh.Session]]:
         yield both
 
 
-def invent(outsider: zenoh.Session, count: int) -> None:
-    """A message under each of so many names."""
-    for number in range(count):
-        outsider.put(f"hvt/ghost-{number}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+def say(outsider: zenoh.Session, edge: str, channel: str = "base") -> None:
+    """A message under that name."""
+    outsider.put(f"hvt/{edge}/{channel}", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
 
 
-def served(link: GroundLink) -> set[str]:
-    """The names of all ports."""
-    return {port.edge for port in link.ports()}
+def show(outsider: zenoh.Session, *edges: str) -> list[zenoh.LivelinessToken]:
+    """The tokens of these names."""
+    return [outsider.liveliness().declare_token(f"hvt/{edge}/alive") for edge in edges]
+
+
+def served(link: GroundLink) -> dict[str, EdgePort]:
+    """All ports by name."""
+    return {port.edge: port for port in link.ports()}
 
 
 def test_an_edge_that_was_not_asked_for_is_not_served(free_port):
     """A shared link would carry the streams of everybody to everybody."""
     with ground_of("uav-*", free_port) as (ground, outsider):
         for edge in ("rover-1", "uav-1"):
-            outsider.put(f"hvt/{edge}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+            say(outsider, edge)
         eventually(lambda: served(ground), what="one is served")
-        assert served(ground) == {"uav-1"}
+        assert served(ground).keys() == {"uav-1"}
 
 
 def test_invented_names_do_not_lock_out_a_real_edge(link, caplog):
     """Somebody says 64 names, and the drone that starts afterwards is never shown, without a word."""
     ground, outsider = link
-    invent(outsider, MAX_EDGES + 6)
+    for number in range(MAX_EDGES + 6):
+        say(outsider, f"ghost-{number}")
     eventually(lambda: ground.foreign == 6, what="all names have come")
     assert len(served(ground)) == MAX_EDGES
     lines = [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
-    assert lines == [
-        (
-            f"ghost-{MAX_EDGES} is not served: there are {MAX_EDGES} edge ids already, and more are not taken; "
-            "narrow --edges, or see who invents names (docs/security.md has keys against that)"
-        )
-    ]
+    (line,) = lines
+    assert line == (
+        f"ghost-{MAX_EDGES} is not served: there are {MAX_EDGES} edge ids already, and more are not taken; narrow "
+        "--edges, or see who invents names (docs/security.md has keys against that)"
+    )
     first = ground.ports()[0]
     with outsider.liveliness().declare_token("hvt/uav-1/alive"):
         eventually(lambda: "uav-1" in served(ground), what="the real one is served")
@@ -93,16 +97,16 @@ def test_tokens_alone_do_not_keep_out_an_edge_that_sends(link):
     """Somebody shows a thousand tokens, and the drone that starts afterwards is never shown."""
     ground, outsider = link
     count = 2 * MAX_EDGES + 2
-    tokens = [outsider.liveliness().declare_token(f"hvt/ghost-{number}/alive") for number in range(count)]
+    tokens = show(outsider, *(f"ghost-{number}" for number in range(count)))
     with outsider.liveliness().declare_token("hvt/uav-1/alive"):
         eventually(lambda: ground.is_known("uav-1"), what="its token has come")
         assert "uav-1" not in served(ground)
-        outsider.put("hvt/uav-1/status", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        say(outsider, "uav-1", "status")
         eventually(lambda: "uav-1" in served(ground), what="it is served")
-        (port,) = [port for port in ground.ports() if port.edge == "uav-1"]
+        port = served(ground)["uav-1"]
         assert port.present.is_set()
         assert port.inbox.get(timeout_s=0.1) is not None
-        outsider.put("hvt/ghost-0/status", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        say(outsider, "ghost-0", "status")
         assert len(served(ground)) == MAX_EDGES
     for token in tokens:
         token.undeclare()
@@ -111,22 +115,19 @@ def test_tokens_alone_do_not_keep_out_an_edge_that_sends(link):
 def test_edges_that_are_there_or_fly_keep_their_place(link):
     """A stranger's token would end a flight."""
     ground, outsider = link
-    tokens = [
-        outsider.liveliness().declare_token(f"hvt/real-{number}/alive") for number in range(MAX_EDGES - 1)
-    ]
+    tokens = show(outsider, *(f"real-{number}" for number in range(MAX_EDGES - 1)))
     eventually(lambda: len(served(ground)) == MAX_EDGES - 1, what="all are seen")
-    invent(outsider, 1)
+    say(outsider, "ghost-0")
     eventually(lambda: "ghost-0" in served(ground), what="one more")
-    (ghost,) = [port for port in ground.ports() if port.edge == "ghost-0"]
+    ghost = served(ground)["ghost-0"]
     ghost.used.set()
     with outsider.liveliness().declare_token("hvt/late/alive"):
         eventually(lambda: ground.foreign == 1, what="it is refused")
         assert "late" not in served(ground)
         ghost.used.clear()
-        outsider.put("hvt/late/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        say(outsider, "late", "base")
         eventually(lambda: "late" in served(ground), what="a flight has ended, so there is a place")
-        (late,) = [port for port in ground.ports() if port.edge == "late"]
-        assert late.present.is_set()
+        assert served(ground)["late"].present.is_set()
     for token in tokens:
         token.undeclare()
 
@@ -153,7 +154,7 @@ def test_a_ground_says_which_stills_it_reads(link):
         outsider, Channel.INFO, keys=keys, answer=lambda question: questions.append(question) or INFO.pack()
     )
     with outsider.liveliness().declare_token(keys[Channel.ALIVE]):
-        eventually(lambda: served(ground) == {"uav-1"}, what="it is served")
+        eventually(lambda: served(ground), what="it is served")
         (port,) = ground.ports()
         for count in (1, 2):
             port.query_info(7)
@@ -164,31 +165,22 @@ def test_a_ground_says_which_stills_it_reads(link):
     assert {"jpeg", "h264-intra", "residual"} <= set(first.still_codecs) <= set(still_codec_names())
 
 
-class Clock:
-    """The link's, which fails where the test says so."""
+def test_an_error_in_a_callback_reaches_the_edges_thread(free_port: int, capfd) -> None:
+    """Zenoh would print a traceback for every message, and nobody would learn that nothing comes in any more."""
+    broken, errors = threading.Event(), list[str]()
 
-    def __init__(self) -> None:
-        self.broken = False
-
-    def __call__(self) -> int:
-        """Now."""
-        if self.broken:
+    def clock() -> int:
+        if broken.is_set():
             raise RuntimeError("the clock is gone")
         return time.time_ns()
 
-
-def test_an_error_in_a_callback_reaches_the_edges_thread(free_port: int, capfd) -> None:
-    """Zenoh would print a traceback for every message, and nobody would learn that nothing comes in any more."""
-    clock = Clock()
     with ground_of("*", free_port, clock=clock) as (ground, outsider):
         for edge in ("uav-1", "uav-2"):
-            outsider.put(f"hvt/{edge}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+            say(outsider, edge)
         eventually(lambda: len(served(ground)) == 2, what="both are served")
         one, other = sorted(ground.ports(), key=lambda port: port.edge)
-        clock.broken = True
-        outsider.put("hvt/uav-1/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
-
-        errors: list[str] = []
+        broken.set()
+        say(outsider, "uav-1")
 
         def failed() -> bool:
             try:
@@ -292,20 +284,15 @@ def test_an_edge_that_is_left_while_a_report_goes_out(free_port: int) -> None:
 
 def test_silent_edges_hold_up_nobody(free_port: int) -> None:
     """With eight edges that do not answer, each round of asking for their time would take eight seconds."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
     asked: list[zenoh.Query] = []
-    with (
-        open_session(LinkSettings("ground", listen=(endpoint,))) as session,
-        GroundLink(session, edges="*") as ground,
-        joined(endpoint) as outsider,
-    ):
+    with ground_of("*", free_port) as (ground, outsider):
         queryables = [outsider.declare_queryable(f"hvt/uav-{one}/info", asked.append) for one in range(8)]
-        tokens = [outsider.liveliness().declare_token(f"hvt/uav-{one}/alive") for one in range(8)]
+        tokens = show(outsider, *(f"uav-{one}" for one in range(8)))
         eventually(lambda: len(served(ground)) == 8, what="all are seen")
         for port in ground.ports():
             port.request_info(INFO.session_id)
         eventually(lambda: len(asked) == 8, what="all are asked")
-        ports = {port.edge: port for port in ground.ports()}
+        ports = served(ground)
         assert all(port.take_info() is None for port in ports.values())
 
         def answered() -> bool:
@@ -404,25 +391,19 @@ class Shared:
 @pytest.mark.parametrize("moves", [False, True])
 def test_in_a_group_an_edge_that_made_space_may_come_back_or_move(free_port: int, moves: bool) -> None:  # noqa: FBT001
     """The member, and with it the video of 63 others, ended with a KeyError."""
-    endpoint, group = f"tcp/127.0.0.1:{free_port}", Shared()
-    with (
-        open_session(LinkSettings("ground", listen=(endpoint,))) as session,
-        GroundLink(session, edges="*", group=group) as link,  # type: ignore[arg-type]
-        joined(endpoint) as outsider,
-    ):
-        tokens = [
-            outsider.liveliness().declare_token(f"hvt/uav-{number}/alive") for number in range(MAX_EDGES)
-        ]
+    group = Shared()
+    with ground_of("*", free_port, group=group) as (link, outsider):
+        tokens = show(outsider, *(f"uav-{number}" for number in range(MAX_EDGES)))
         eventually(lambda: len(link.ports()) == MAX_EDGES, what="all are served")
-        (first,) = [one for one in link.ports() if one.edge == "uav-0"]
+        first = served(link)["uav-0"]
         tokens[0].undeclare()  # type: ignore[no-untyped-call]
         eventually(lambda: not first.present.is_set(), what="it is gone, without a picture")
-        tokens.append(outsider.liveliness().declare_token("hvt/new/alive"))
+        tokens += show(outsider, "new")
         eventually(lambda: "new" in served(link), what="it has made space")
         assert len(link.ports()) == MAX_EDGES
         link.closed(first)
         group.elsewhere |= {"uav-0"} if moves else {"uav-1"}
-        tokens.append(outsider.liveliness().declare_token("hvt/uav-0/alive"))
+        tokens += show(outsider, "uav-0")
         eventually(lambda: link.is_known("uav-0"), what="it is back")
         eventually(lambda: ("uav-0" in served(link)) is not moves, what="it is where it belongs")
         assert len(link.ports()) == MAX_EDGES

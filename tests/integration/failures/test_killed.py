@@ -105,10 +105,7 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight
             before, files = {one.name for one in old}, {one.file for one in whole}
             return before <= files and any(one.file not in before and not one.backlog for one in whole)
 
-        eventually(
-            closed,
-            what="what the killed edge flew is closed, and some of what came then",
-        )
+        eventually(closed, what="what the killed edge flew is closed, and some of what came then")
         first.kill()
         left = [one for one in files() if one.stat().st_size]
         described = {one.file: one for one in read_index(flights)}
@@ -142,9 +139,7 @@ def test_the_killed_ground_left_recordings_and_an_index_that_can_be_read(flight)
     seen = frames(recorded)
     assert len(seen) > 20
     assert all(one < other for one, other in pairwise(seen))
-    assert len(seen) == sum(flight.rows[one.name].frames for one in recorded), (
-        "a killed file is counted by what it has"
-    )
+    assert len(seen) == sum(flight.rows[one.name].frames for one in recorded), "by what a killed file has"
 
 
 def test_a_ground_started_in_mid_flight_shows_the_edge_that_never_stopped(flight):

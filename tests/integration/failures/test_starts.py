@@ -102,8 +102,7 @@ def test_a_port_that_another_program_holds_is_waited_for(opened, caplog):
 @pytest.mark.parametrize("opened", [metrics, web, listener])
 def test_who_waits_for_a_port_ends_at_once(opened):
     """Ctrl-C would do nothing until the port is free, which it is here after the end alone."""
-    holder = Holder()
-    with opened(holder, Failures(time.time_ns)):
+    with opened(holder := Holder(), Failures(time.time_ns)):
         pass
     holder.let_go()
 
@@ -111,14 +110,10 @@ def test_who_waits_for_a_port_ends_at_once(opened):
 @pytest.mark.parametrize(
     "open_it",
     [
-        pytest.param(
-            lambda at, failures: HealthServer(f"{at}:9464", {}, failures=failures),
-            id="metrics",
-        ),
-        pytest.param(
-            lambda at, failures: WebPage(f"{at}:80", clock=time.time_ns, failures=failures), id="web"
-        ),
+        lambda at, failures: HealthServer(f"{at}:9464", {}, failures=failures),
+        lambda at, failures: WebPage(f"{at}:80", clock=time.time_ns, failures=failures),
     ],
+    ids=["metrics", "web"],
 )
 @pytest.mark.parametrize(
     ("at", "says"),

@@ -97,12 +97,7 @@ def test_who_gives_itself_the_right_is_refused_there_and_told(
     flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A file is text: who writes more rights into it must not have them; an honest mistake needs its reason."""
-    bold = flight.fleet.changed(
-        "ops",
-        connect_certificate=str(flight.fleet.folder / "guest.pem"),
-        connect_private_key=str(flight.fleet.folder / "guest.key"),
-    )
-    out = tmp_path / "crop.png"
+    out, bold = tmp_path / "crop.png", flight.fleet.bold("ops")
     assert flight.asked("still", "--edge", "uav-1", "--out", str(out), file=bold) == 2
     said = capsys.readouterr().err
     assert said.startswith(

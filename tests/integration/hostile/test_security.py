@@ -101,10 +101,8 @@ def refused(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
         watches = {}
         for name, settings in callers.items():
             session = stack.enter_context(_unchecked(settings))
-            watches[name] = (
-                session,
-                stack.enter_context(Watch(session, settings, served=lambda _: True, patience_s=PATIENCE_S)),
-            )
+            watch = Watch(session, settings, served=lambda _: True, patience_s=PATIENCE_S)
+            watches[name] = session, stack.enter_context(watch)
         eventually(lambda: all(watch.trouble for _, watch in watches.values()), what="all are explained")
         assert [list(ground.info.peers_zid()) for ground in grounds] == [[], [], []]
         return {
@@ -149,21 +147,13 @@ def test_an_edge_cannot_write_as_another(
     came: list[str] = []
     with ExitStack() as stack:
         ground = stack.enter_context(open_session(ground_settings))
-        ground.declare_subscriber("hvt/**", lambda sample: came.append(str(sample.key_expr)))
-        ground.liveliness().declare_subscriber(
-            "hvt/**", lambda sample: came.append(str(sample.key_expr)), history=True
-        )
-        forger = stack.enter_context(
-            open_session(replace(fleet.settings("uav-1", "edge", connect=(endpoint,)), name=None))
-        )
-        stack.enter_context(
-            Watch(
-                ground,
-                ground_settings,
-                served=lambda name: f"hvt/{name}/alive" in came,
-                patience_s=PATIENCE_S,
-            )
-        )
+        take = lambda sample: came.append(str(sample.key_expr))  # noqa: E731
+        ground.declare_subscriber("hvt/**", take)
+        ground.liveliness().declare_subscriber("hvt/**", take, history=True)
+        forging = replace(fleet.settings("uav-1", "edge", connect=(endpoint,)), name=None)
+        forger = stack.enter_context(open_session(forging))
+        served = lambda name: f"hvt/{name}/alive" in came  # noqa: E731
+        stack.enter_context(Watch(ground, ground_settings, served=served, patience_s=PATIENCE_S))
         forger.liveliness().declare_token(UAV2[Channel.ALIVE])
         serve(forger, Channel.INFO, keys=UAV2, answer=lambda _question: b"forged")
         own = declare_publisher(forger, Channel.STATUS, keys=UAV1)
@@ -186,12 +176,7 @@ def test_watching_commanding_and_being_a_stranger(
     with ExitStack() as stack:
         edge = stack.enter_context(_edge(fleet, endpoint))
         # A guest who has changed its own file to that of a ground that commands: the edge has to refuse it.
-        bold = fleet.changed(
-            "base",
-            connect_certificate=str(fleet.folder / "guest.pem"),
-            connect_private_key=str(fleet.folder / "guest.key"),
-        )
-        files = {"base": fleet.file("base"), "guest": bold, "stranger": fleet.file("stranger")}
+        files = {"base": fleet.file("base"), "guest": fleet.bold("base"), "stranger": fleet.file("stranger")}
         grounds = {
             name: stack.enter_context(
                 open_session(LinkSettings("ground", connect=(endpoint,), zenoh_config=file))
@@ -294,16 +279,8 @@ def test_an_edge_with_unfit_keys_does_not_start(
     What else keys may lack is in tests/extras/fleet/link/test_diagnose.py.
     """
     file = fleet.file("uav-1")
-    asked = [
-        *_words(scene),
-        "--connect",
-        "tls/127.0.0.1:9",
-        "--zenoh-config",
-        str(file),
-        "--edge-id",
-        "uav-2",
-    ]
-    assert hvt_edge.cli.main(asked) == 2
+    asked = ("--connect", "tls/127.0.0.1:9", "--zenoh-config", str(file), "--edge-id", "uav-2")
+    assert hvt_edge.cli.main([*_words(scene), *asked]) == 2
     said = capfd.readouterr().err
     assert said.count("\n") == 1, said
     pem = fleet.folder / "uav-1.pem"
@@ -320,14 +297,10 @@ def test_a_ground_that_gets_no_answer_on_control_is_told(
 
     caplog.set_level(logging.WARNING)
     endpoint = f"tls/127.0.0.1:{free_port}"
-    bold = fleet.changed(
-        "base",
-        connect_certificate=str(fleet.folder / "guest.pem"),
-        connect_private_key=str(fleet.folder / "guest.key"),
-    )
+    settings = LinkSettings("ground", connect=(endpoint,), zenoh_config=fleet.bold("base"))
     with (
         _edge(fleet, endpoint),
-        open_session(LinkSettings("ground", connect=(endpoint,), zenoh_config=bold)) as session,
+        open_session(settings) as session,
         GroundLink(session, edges="*") as link,
     ):
         eventually(link.ports, what="the edge is seen")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -15,12 +14,7 @@ import pytest
 
 from programs.processes import PATIENT_S, Link, Running, eventually, free_ports
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-pytestmark = [
-    pytest.mark.integration,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt install chromium)"),
-]
+pytestmark = pytest.mark.integration
 
 _PIXELS = """() => {
   const video = document.getElementById("video");
@@ -49,12 +43,10 @@ class Flight:
 
 
 @pytest.fixture(scope="module")
-def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
-    from playwright.sync_api import sync_playwright
-
+def flight(browser: Any, long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
     folder = tmp_path_factory.mktemp("page")
     port = free_ports(1)[0]
-    with Link(folder, name="page") as link, sync_playwright() as playwright:
+    with Link(folder, name="page") as link:
         ground = link.ground(
             *("--record", "flight.rrd", "--detector", "motion", "--classifier", "none"),
             *("--web", f"127.0.0.1:{port}"),
@@ -65,9 +57,7 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
             *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--edge-id", "uav-1"),
             *("--method", "M5", "--detector", "motion", "--cooldown", "0s"),
         )
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield Flight(f"http://127.0.0.1:{port}/", edge, browser)
-        browser.close()
         assert ground.alive
         assert "Traceback" not in ground.said
 
@@ -77,10 +67,8 @@ def page(flight: Flight) -> Iterator[Any]:
     page = flight.page()
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on(
-        "console",
-        lambda said: errors.append(f"{said.text} {said.location}") if said.type == "error" else None,
-    )
+    logged = lambda said: said.type == "error" and errors.append(f"{said.text} {said.location}")  # noqa: E731
+    page.on("console", logged)
     yield page
     # A still's picture may be gone before a slow browser asks for it.
     assert [error for error in errors if not ("404" in error and "/stills/" in error)] == []
@@ -127,11 +115,8 @@ def test_boxes_are_drawn_on_the_frame_that_is_shown(page):
 
 def test_a_click_brings_a_still_of_that_place(page):
     """The operator could look, and not look closer."""
-    title = page.locator("#objects-title")
-    eventually(
-        lambda: re.search(r"\d", title.inner_text()),
-        what="a list has come: its clock tells when a still was taken",
-    )
+    listed = lambda: re.search(r"\d", page.locator("#objects-title").inner_text())  # noqa: E731
+    eventually(listed, what="a list has come: its clock tells when a still was taken")
     shows(page, after=shows(page) + 10)
     page.locator("#boxes").click(position={"x": 300, "y": 150})
     image = page.locator("#answer-picture")
@@ -212,9 +197,8 @@ def test_an_edge_that_is_not_here_is_not_another(flight):
     """Another edge's picture would be shown to who asked for this one."""
     page = flight.page("edge=uav-9")
     page.locator("#absent").wait_for(state="visible")
-    assert page.locator("#absent").bounding_box()["y"] < page.locator("#wall").bounding_box()["y"], (
-        "before all"
-    )
+    absent, wall = (page.locator(one).bounding_box()["y"] for one in ("#absent", "#wall"))
+    assert absent < wall, "before all"
     assert page.inner_text("#absent").startswith("uav-9, which the address names, is not here")
     assert page.locator("#main").is_hidden()
     page.locator('.edge[data-edge="uav-1"]').click()

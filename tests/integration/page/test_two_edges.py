@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
+import itertools
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -16,13 +17,7 @@ from media.moving_square import FPS, SIZE, moving_square
 from programs.processes import eventually, free_ports
 from rigs.messages import INFO
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-pytestmark = [
-    pytest.mark.nightly,
-    pytest.mark.integration,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt install chromium)"),
-]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 
 _SHOWN = """() => {
   const video = document.getElementById("video");
@@ -41,20 +36,18 @@ def address() -> Iterator[str]:
     with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as page:
 
         def fly(edge: str, number: int, *, stops: bool) -> None:
-            info = replace(
-                INFO, edge=edge, session_id=number, base_size=SIZE, source_size=SIZE, fps=FPS, pace="realtime"
-            )
-            sink = page.feed(info)()
-            index = 0
-            while not ended.wait(1 / FPS):
-                data, keyframe = units[index % len(units)]
+            sizes: Any = {"base_size": SIZE, "source_size": SIZE, "fps": FPS, "pace": "realtime"}
+            sink = page.feed(replace(INFO, edge=edge, session_id=number, **sizes))()
+            for index, (data, keyframe) in enumerate(itertools.cycle(units)):
+                if ended.wait(1 / FPS):
+                    return
                 if not stops:
                     sink.log(VideoSample(index, time.time_ns(), data, keyframe))
-                index += 1
 
+        flights = (("flies", 1, False), ("silent", 2, True))
         threads = [
-            threading.Thread(target=fly, args=("flies", 1), kwargs={"stops": False}),
-            threading.Thread(target=fly, args=("silent", 2), kwargs={"stops": True}),
+            threading.Thread(target=fly, args=(edge, number), kwargs={"stops": stops})
+            for edge, number, stops in flights
         ]
         for one in threads:
             one.start()
@@ -65,32 +58,25 @@ def address() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("rung", ["h264", "jpeg"])
-def test_no_pixel_of_one_edge_stands_under_the_name_of_another(address, rung):
+def test_no_pixel_of_one_edge_stands_under_the_name_of_another(browser, address, rung):
     """An operator would take the first edge's street for the second one's, in colour."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page()
-        page.goto(f"{address}#edge=flies&rung={rung}")
-        eventually(lambda: page.evaluate(_SHOWN)["drawn"], what="the first edge's picture")
-        page.locator('.edge[data-edge="silent"]').click()
-        for _ in range(10):
-            assert page.evaluate(_SHOWN) == {"drawn": False, "name": "silent"}
-            time.sleep(0.1)
-        assert page.inner_text("#objects-title") == "Tracks: not known yet"
-        page.locator('.edge[data-edge="flies"]').click()
-        eventually(lambda: page.evaluate(_SHOWN)["drawn"], what="the first edge's picture again")
-        browser.close()
+    page = browser.new_page()
+    page.goto(f"{address}#edge=flies&rung={rung}")
+    eventually(lambda: page.evaluate(_SHOWN)["drawn"], what="the first edge's picture")
+    page.locator('.edge[data-edge="silent"]').click()
+    for _ in range(10):
+        assert page.evaluate(_SHOWN) == {"drawn": False, "name": "silent"}
+        time.sleep(0.1)
+    assert page.inner_text("#objects-title") == "Tracks: not known yet"
+    page.locator('.edge[data-edge="flies"]').click()
+    eventually(lambda: page.evaluate(_SHOWN)["drawn"], what="the first edge's picture again")
+    page.close()
 
 
-def test_an_edge_that_starts_again_bears_no_word_of_the_flight_before():
+def test_an_edge_that_starts_again_bears_no_word_of_the_flight_before(browser):
     """``this session has ended`` stood beside the green light of one that flies."""
-    from playwright.sync_api import sync_playwright
-
     (port,) = free_ports(1)
-    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as ground, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as ground:
         page = browser.new_page()
         page.goto(f"http://127.0.0.1:{port}/")
         ground.feed(INFO)().log(Notice(0, 0, "info", "the flight has ended"))
@@ -100,4 +86,4 @@ def test_an_edge_that_starts_again_bears_no_word_of_the_flight_before():
         ground.feed(replace(INFO, session_id=INFO.session_id + 1))()
         for where in (".last", "#settings-text"):
             eventually(lambda where=where: not page.text_content(where), what=f"no word in {where}")
-        browser.close()
+        page.close()

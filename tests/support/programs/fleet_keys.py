@@ -69,3 +69,8 @@ class Fleet:
         file = self.folder / f"{name}-{'-'.join(tls)}.json5"
         file.write_text(json.dumps(said))
         return file
+
+    def bold(self, name: str) -> Path:
+        """The configuration of a machine in the hands of ``guest``, who watches alone: it has guest's own key."""
+        guest = {"certificate": self.folder / "guest.pem", "private_key": self.folder / "guest.key"}
+        return self.changed(name, **{f"connect_{what}": str(file) for what, file in guest.items()})

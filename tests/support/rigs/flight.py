@@ -30,7 +30,7 @@ from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.models import Detection, DetectorThread, ModelFacts, Models
-from hvt_ground.perception.pipeline import Pipeline, PipelineParts
+from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
 from hvt_ground.perception.stills.decode import DecodedStill
@@ -165,27 +165,24 @@ def pipeline_of(
     """The perception pipeline of a session of this flight."""
     reader = reader or SameAnswer()
     names, places = unified_names(CLASSES, edge_classes)
-    path = CameraPath(ahead_frames=15)
-    vocabulary = Vocabulary(names, reader.class_names)
-    parts = PipelineParts(
+    return Pipeline(
         detector=detector or RedSquares(),
         tracker=ByteTracker(
             TrackerSettings.starting_at(0.25, camera_motion="flow" if detect_still_every else "off"), fps=15
         ),
         reader=reader,
-        refiner=Refiner("replace", fps=15, vocabulary=vocabulary, tilt=tilt),
-        vocabulary=vocabulary,
-        fusion=Fusion(fps=15, edge_classes=places, path=path),
-        path=path,
+        refiner=Refiner("replace", fps=15, vocabulary=Vocabulary(names, reader.class_names), tilt=tilt),
+        fusion=Fusion(fps=15, edge_classes=places, path=CameraPath(ahead_frames=15)),
         detector_thread=detector_thread or DetectsAtOnce(),
         trust=trust or ViewTrust(None, hence=""),
         edge_alike=tuple(edge_classes) == CLASSES,
         guesses=guesses,
         search=search,
-    )
-    view = View.fitted(SIZE, SIZE, fit="letterbox")
-    return Pipeline(
-        parts, view=view, fps=15, detect_every=detect_every, detect_still_every=detect_still_every, emit=emit
+        view=View.fitted(SIZE, SIZE, fit="letterbox"),
+        fps=15,
+        detect_every=detect_every,
+        detect_still_every=detect_still_every,
+        emit=emit,
     )
 
 

@@ -107,7 +107,7 @@ class Fusion:
         base_per_source: float = 1.0,
     ) -> None:
         self._edge_classes = edge_classes
-        self._path = path
+        self.path = path
         self._rules = FusionRules(
             patience=max(1, round(PATIENCE_S * fps)),
             reach=max(1, round(REACH_S * fps)),
@@ -220,7 +220,7 @@ class Fusion:
         entity.still_frame, entity.is_doubted = max(entity.still_frame, frame_index), False
         observed, own = entity.reported, self._own.get(frame_index)
         if entity.edge_id is None and observed is not None and frame_index > observed.frame_index:
-            entity.reported = observed.updated(box, frame_index, observed.confidence, path=self._path)
+            entity.reported = observed.updated(box, frame_index, observed.confidence, path=self.path)
             entity.last_frame = max(entity.last_frame, frame_index)
         if own is not None and entity.own_id in own.ids:
             row = int(np.flatnonzero(own.ids == entity.own_id)[0])
@@ -229,7 +229,7 @@ class Fusion:
     def listed(self, own: Tracks) -> FusedTracks:
         """The list at the frame of ``own``: our tracker's list of a frame, or moved on from the newest."""
         reporting = own.frame_index - self._stepped <= self._rules.patience
-        return list_entities(self._entities, own, path=self._path, rules=self._rules, doubting=reporting)
+        return list_entities(self._entities, own, path=self.path, rules=self._rules, doubting=reporting)
 
     # Learning
 
@@ -254,7 +254,7 @@ class Fusion:
         if observed is None or frame_index - observed.frame_index > self._rules.patience:
             entity.reported = Observation(box, frame_index, confidence)
         else:
-            entity.reported = observed.updated(box, frame_index, confidence, path=self._path)
+            entity.reported = observed.updated(box, frame_index, confidence, path=self.path)
         entity.last_frame = max(entity.last_frame, frame_index)
         entity.edge_vote.update(int(self._edge_classes[step.class_ids[row]]), confidence)
 
@@ -357,7 +357,7 @@ class Fusion:
         return entity.is_report_live(frame_index, patience=self._rules.patience)
 
     def _reported_boxes(self, entities: Sequence[Entity], frame_index: int) -> npt.NDArray[np.float64]:
-        return reported_boxes(entities, frame_index, path=self._path, reach=self._rules.reach)
+        return reported_boxes(entities, frame_index, path=self.path, reach=self._rules.reach)
 
 
 def _usable(step: Tracks, *, classes: int) -> list[int]:

@@ -14,7 +14,7 @@ from hvt_common.inference.detect import FailingDetector, OnnxDetector
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.values import Boxes, Detections, Image, Posterior, View, iou
 from hvt_ground.perception.stills.composite import composite
-from hvt_ground.perception.stills.decode import Box, DecodedStill
+from hvt_ground.perception.stills.decode import Box, DecodedStill, box_of
 
 _SAME_OBJECT_IOU = 0.4
 """A detection on the composite that overlaps an object's box less is of something else."""
@@ -167,7 +167,7 @@ class Redetection:
             # neighbour's detection may be more confident than the object's own.
             best = int(at_place[np.argmax(overlap[at_place])])
             readings.append(
-                ObjectReading(self._posterior(found, best, at_place), _box(found.boxes_xyxy_px[best]))
+                ObjectReading(self._posterior(found, best, at_place), box_of(found.boxes_xyxy_px[best]))
             )
         return readings
 
@@ -223,8 +223,3 @@ def _share_inside(boxes: Boxes, areas: Boxes) -> npt.NDArray[np.float64]:
     shared = np.clip(last - first, 0, None).prod(axis=2)
     whole = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None).prod(axis=1)
     return np.asarray(shared / whole[:, None], np.float64)
-
-
-def _box(box: npt.NDArray[np.float32]) -> Box:
-    x1, y1, x2, y2 = box.tolist()
-    return x1, y1, x2, y2

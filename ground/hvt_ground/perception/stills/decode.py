@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import MAX_STILL_CODECS, RoiHeader
 from hvt_common.values import Image, View
@@ -36,6 +39,12 @@ class DecodedStill:
     boxes_base_px: tuple[Box, ...]
     """The lead object's box, then those of the others, in the order of the header's ``also``."""
     frame_index: int
+
+
+def box_of(row: npt.NDArray[np.float32]) -> Box:
+    """An array of (4,) as a value."""
+    x1, y1, x2, y2 = row.tolist()
+    return x1, y1, x2, y2
 
 
 def readable_codecs() -> tuple[str, ...]:

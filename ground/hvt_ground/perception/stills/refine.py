@@ -35,10 +35,6 @@ MAX_TRACK_POSTERIORS = 1024
 _REMEMBERED_STILLS = 4096
 
 
-def _unknown(_edge_track_id: int) -> None:
-    """No track: the edge reports none."""
-
-
 class Refiner:
     """Holds stills until their track is known, and the classes that came of them. One for each session.
 
@@ -67,7 +63,7 @@ class Refiner:
         self.tilt = tilt or ViewTilt()
         """No kind of vehicle is sure unless the view is known to be steep."""
         self._mode = mode
-        self._vocabulary = vocabulary
+        self.vocabulary = vocabulary
         self._calibrated = calibrated
         self._hold_frames = round(hold_s * fps)
         self._confirm_frames = round(confirm_s * fps)
@@ -96,7 +92,7 @@ class Refiner:
         return [self._unmatched(self._held.pop(oldest)[0], "overflow")]
 
     def settle(
-        self, history: History, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
+        self, history: History, *, now_frame: int, known_as: Callable[[int], int | None] = lambda _id: None
     ) -> list[StillSeen]:
         """Match stills where that is possible and give up those that never will be, oldest frame first.
 
@@ -158,7 +154,7 @@ class Refiner:
 
     def preview(self, tracks: Tracks, *, capture_ns: int = 0, origins: tuple[Origin, ...] = ()) -> Overlay:
         """The overlay that these tracks would have; changes nothing, so any frame may be requested."""
-        names = self._vocabulary.names
+        names = self.vocabulary.names
         base_classes = tuple(names[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
         confidences = tracks.confidences.astype(np.float32)  # a copy
@@ -219,7 +215,7 @@ class Refiner:
         last = min(tracks.frame_index + self._confirm_frames, history.newest_tracked or 0)
         later = (history.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
         return self._matcher.match(
-            held, tracks, later=(t for t in later if t is not None), class_names=self._vocabulary.names
+            held, tracks, later=(t for t in later if t is not None), class_names=self.vocabulary.names
         )
 
     def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> StillSeen:
@@ -244,7 +240,7 @@ class Refiner:
         self._touch(track_id, class_posterior, still.event.shown_at[0])
         after = self._read(class_posterior, tracks, row)
         self.class_changes += after.class_id != before.class_id
-        names = self._vocabulary.names
+        names = self.vocabulary.names
         event = replace(
             still.event,
             track_id=track_id,
@@ -267,33 +263,31 @@ class Refiner:
 
     def _read(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> ClassEstimate:
         if self._mode == "replace":
-            return class_posterior.newest(self._vocabulary, class_id=int(tracks.class_ids[row]))
+            return class_posterior.newest(self.vocabulary, class_id=int(tracks.class_ids[row]))
         return class_posterior.fused(
-            self._vocabulary, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
+            self.vocabulary, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
         )
 
     def _is_of_another(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> bool:
         # The tracker asks for no class: a person who takes the place of a car has its track, and would have its name.
-        names, now = self._vocabulary.names, self._vocabulary.names[tracks.class_ids[row]]
+        names, now = self.vocabulary.names, self.vocabulary.names[tracks.class_ids[row]]
         if not are_apart(now, names[class_posterior.base_class_id]):
             return False
         return are_apart(now, names[self._read(class_posterior, tracks, row).class_id])
 
     def _is_doubted(self, reading: ClassEstimate, base_class: str) -> bool:
-        contradicts = are_apart(base_class, self._vocabulary.names[reading.class_id])
-        return reading.class_id == self._vocabulary.nothing or (
-            contradicts and not self._is_believed(reading)
-        )
+        contradicts = are_apart(base_class, self.vocabulary.names[reading.class_id])
+        return reading.class_id == self.vocabulary.nothing or (contradicts and not self._is_believed(reading))
 
     def _is_sure(self, reading: ClassEstimate) -> bool:
-        nothing = reading.class_id == self._vocabulary.nothing
+        nothing = reading.class_id == self.vocabulary.nothing
         return self._calibrated and not nothing and self._is_believed(reading)
 
     def _is_believed(self, reading: ClassEstimate) -> bool:
         # Stills are right about vehicles only from straight above: aslant a hydrant was a truck, at .91.
         steep = self.tilt.aslant is False
         return reading.sure and (
-            steep or kind_of(self._vocabulary.names[reading.class_id]) not in VEHICLE_KINDS
+            steep or kind_of(self.vocabulary.names[reading.class_id]) not in VEHICLE_KINDS
         )
 
     def _touch(self, track_id: int, class_posterior: TrackPosterior, frame_index: int) -> None:

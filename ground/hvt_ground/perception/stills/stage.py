@@ -17,10 +17,16 @@ from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.fusion.fuse import Fusion
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import ObjectReading, StillReader
-from hvt_ground.perception.stills.decode import Box, DecodedStill, ReceivedStill, decode_still, needs_base
+from hvt_ground.perception.stills.decode import (
+    Box,
+    DecodedStill,
+    ReceivedStill,
+    box_of,
+    decode_still,
+    needs_base,
+)
 from hvt_ground.perception.stills.match import StillSeen
 from hvt_ground.perception.stills.refine import Refiner
-from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 _log = logging.getLogger(__name__)
 
@@ -45,15 +51,11 @@ class Progress:
 
 @dataclass(eq=False)
 class StillStage:
-    """One session's stills. Used by one thread; ``emit`` takes the events.
-
-    ``vocabulary`` is that of ``reader`` and ``refiner``.
-    """
+    """One session's stills. Used by one thread; ``emit`` takes the events."""
 
     reader: StillReader
     refiner: Refiner
     _: KW_ONLY
-    vocabulary: Vocabulary
     history: History
     fusion: Fusion
     view: View
@@ -81,8 +83,7 @@ class StillStage:
     def update(self, now: Progress) -> None:
         """Read stills that need not wait longer, and settle them if possible: call it after each picture and step."""
         ready = [still for still in self._pending if not self._may_wait(still.header, now)]
-        if ready:
-            self._pending = [still for still in self._pending if self._may_wait(still.header, now)]
+        self._pending = [still for still in self._pending if self._may_wait(still.header, now)]
         while (
             len(self._pending) > MAX_PENDING
             or sum(len(one.data) for one in self._pending) > MAX_PENDING_BYTES
@@ -181,7 +182,7 @@ class StillStage:
             side_px = min(box[2] - box[0], box[3] - box[1]) / self.view.scale
             said, note = reading.posterior, ""
             if said is not None:
-                said, note = self.vocabulary.vote(said, called=header.class_name, side_px=side_px)
+                said, note = self.refiner.vocabulary.vote(said, called=header.class_name, side_px=side_px)
             self._answer(header, track_id, said)
             event = self._refinement(still, decoded, track_id, box, crop)
             if said is None:
@@ -270,8 +271,7 @@ class StillStage:
                 self._results[place] = replace(result, ground_track_id=ground_track_id)
 
     def _to_base(self, box_source_px: Sequence[float]) -> Box:
-        x1, y1, x2, y2 = self.view.to_base(np.array([box_source_px], np.float32))[0].tolist()
-        return x1, y1, x2, y2
+        return box_of(self.view.to_base(np.array([box_source_px], np.float32))[0])
 
     def _notice(self, now: Progress, text: str) -> None:
         self.emit(Notice(now.frame_index, now.capture_ns, "warning", text))

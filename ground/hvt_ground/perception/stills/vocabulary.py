@@ -39,7 +39,7 @@ class Vocabulary:
     def __init__(self, detectors: Sequence[str], reader: Sequence[str], *, kinds: bool = False) -> None:
         self.coarse = is_imagenet(reader)
         """Whether the reader is a network of ImageNet."""
-        words = [_group_word(name) if self.coarse else name for name in reader]
+        words = [group_of(name) or "" if self.coarse else name for name in reader]
         nothing = next((name for name in reader if is_nothing(name)), None) if not self.coarse else None
         self.names = _names(detectors, words, nothing)
         """The classes of tracks; those of ``detectors`` come first, under their own ids."""
@@ -113,11 +113,7 @@ def _names(detectors: Sequence[str], words: Sequence[str], nothing: str | None) 
 def _targets(names: tuple[str, ...], reader: tuple[str, ...], *, groups: bool) -> list[frozenset[int]]:
     # For each class of the reader the classes of ``names`` that it speaks for.
     if groups:
-        grouped = [group_of(name) for name in names]
-        return [
-            frozenset(k for k, group in enumerate(grouped) if group is not None and group == group_of(word))
-            for word in reader
-        ]
+        return [_of_group(word, names) for word in reader]
     said = set(map(_plain, reader))
     trained = not is_imagenet(reader)  # the background of ImageNet was never shown
     return [_meant(word, names, said) if trained or not is_nothing(word) else frozenset() for word in reader]
@@ -129,13 +125,12 @@ def _meant(word: str, names: tuple[str, ...], said: set[str]) -> frozenset[int]:
     own = frozenset(k for k, name in enumerate(names) if same_word(name, word))
     kin = frozenset(k for k, name in enumerate(names) if kind_of(name) == kind_of(word) and name != MOVING)
     nameless = frozenset(k for k in kin if _plain(names[k]) not in said)
+    return (own | nameless) if own else (nameless or kin or _of_group(word, names))
+
+
+def _of_group(word: str, names: tuple[str, ...]) -> frozenset[int]:
     group = group_of(word)
-    tribe = frozenset(k for k, name in enumerate(names) if group is not None and group_of(name) == group)
-    return (own | nameless) if own else (nameless or kin or tribe)
-
-
-def _group_word(name: str) -> str:
-    return group_of(name) or ""
+    return frozenset(k for k, name in enumerate(names) if group is not None and group_of(name) == group)
 
 
 def _plain(name: str) -> str:
