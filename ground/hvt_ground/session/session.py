@@ -7,8 +7,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from functools import partial, wraps
-from typing import ParamSpec
+from functools import partial
+from typing import Any
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.clock_offset import ClockOffset
@@ -43,15 +43,12 @@ _LINES_AT_ONCE = 60
 
 WorkerFactory = Callable[[Analyze, Step, Read], PerceptionWorker]
 
-P = ParamSpec("P")
 
-
-def _perceives(act: Callable[P, None]) -> Callable[P, None]:
+def _perceives(act: Callable[..., None]) -> Callable[..., None]:
     # Of the worker's calls: there is nothing to do where the run ends before models are open.
-    @wraps(act)
-    def acts(*given: P.args, **named: P.kwargs) -> None:
+    def acts(*given: Any) -> None:
         with suppress(NotOpenError):
-            act(*given, **named)
+            act(*given)
 
     return acts
 

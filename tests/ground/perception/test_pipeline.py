@@ -371,13 +371,21 @@ def test_what_the_detector_shows_is_counted_without_what_the_edge_tells(pictures
     assert len(rig.of(Overlay)[-1].track_ids) > 1
 
 
-def test_in_a_hurry_detection_waits_but_the_track_goes_on(pictures):
-    """Boxes would vanish whenever the machine is busy."""
-    rig = Rig()
+@pytest.mark.parametrize(
+    ("every", "hurries", "runs"),
+    [
+        (1, lambda index: index % 4 != 0, 8),  # boxes would vanish whenever the machine is busy
+        # On one that is always behind, whatever comes into view would never have a box: at 0, 8, 16 and 24.
+        (2, lambda _index: True, 4),
+    ],
+)
+def test_in_a_hurry_detection_waits_not_for_ever_and_the_track_goes_on(pictures, every, hurries, runs):
+    """See each case."""
+    rig = Rig(detect_every=every)
     for picture in pictures:
-        rig.pipeline.analyze(picture, hurry=picture.frame_index % 4 != 0)
-    assert rig.pipeline.counts.detections_run == 8
-    assert all(len(one.track_ids) == 1 for one in rig.of(Overlay)[8:])
+        rig.pipeline.analyze(picture, hurry=hurries(picture.frame_index))
+    assert rig.pipeline.counts.detections_run == runs
+    assert all(len(one.track_ids) == 1 for one in rig.of(Overlay)[16:])
 
 
 def test_a_standing_picture_is_searched_less_often(pictures):
@@ -404,14 +412,6 @@ def test_where_another_scene_begins_no_box_of_the_last_one_stays_and_the_new_one
             rig.pipeline.edge_step(tracks_at(2 if index == 2 else 3, {32: (220.0, 20.0, 250.0, 50.0)}))
     assert [one.track_ids.tolist() for one in rig.of(Overlay)] == [[1]] * 3 + [[1, 2]] + [[]] + [[3]] * 5
     assert rig.pipeline.counts.detections_run == 2, "at 0 and at 5"
-
-
-def test_on_a_machine_that_is_always_behind_something_is_detected_now_and_then(pictures):
-    """Whatever comes into view would never have a box."""
-    rig = Rig(detect_every=2)
-    for picture in pictures:
-        rig.pipeline.analyze(picture, hurry=True)
-    assert rig.pipeline.counts.detections_run == 4, "at 0, 8, 16 and 24"
 
 
 def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
@@ -480,26 +480,16 @@ def test_a_still_that_nobody_can_read_is_shown_all_the_same(flight, pictures):
     assert (rig.pipeline.counts.refined, dict(rig.pipeline.counts.outcomes)) == (0, {"unread": 1})
 
 
-def test_what_still_waits_at_the_end_is_given_out(flight, pictures):
-    """The last stills of a flight would be missing from its recording."""
-    rig = Rig().look(pictures[:3])
+def test_a_picture_without_objects_is_an_empty_overlay_and_a_still_that_waits_is_given_out(flight):
+    """An empty scene would show boxes of the past for ever, and the last stills be missing from the recording."""
+    rig = Rig().look([DecodedFrame(0, 0, 0, np.full((192, 320, 3), 120, np.uint8))])
+    (overlay,) = rig.of(Overlay)
+    assert (overlay.boxes_base_px.shape, overlay.classes, rig.pipeline.counts.tracks) == ((0, 4), (), 0)
     rig.pipeline.read([received(flight, 9, 0)])  # its frame will not come
     assert rig.of(Refinement) == []
     rig.pipeline.end()
-    (refinement,) = rig.of(Refinement)
-    assert refinement.track_id is None
+    assert [one.track_id for one in rig.of(Refinement)] == [None]
     assert sum(rig.pipeline.counts.outcomes.values()) == 1
-
-
-def test_a_picture_without_objects_is_an_empty_overlay(flight):
-    """An empty scene would crash perception, or show boxes of the past for ever."""
-    grey = np.full((192, 320, 3), 120, np.uint8)
-    rig = Rig(detector=RedSquares())
-    rig.pipeline.analyze(DecodedFrame(0, 0, 0, grey), hurry=False)
-    (overlay,) = rig.of(Overlay)
-    assert overlay.boxes_base_px.shape == (0, 4)
-    assert (overlay.classes, rig.pipeline.counts.tracks) == ((), 0)
-    assert flight.info().class_names == CLASSES
 
 
 # Residual stills

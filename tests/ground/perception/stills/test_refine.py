@@ -182,7 +182,7 @@ FOUND = [(0, "matched", 1, 5), (1, "matched", 2, 5)]
         # A coin would be tossed for which of two objects is renamed, unless an earlier still tells.
         ("track 5 1=A 2=M; offer 0 5 N; track 6-25 1=A 2=M", [(0, "ambiguous", None, 20)]),
         (
-            "track 40 1=A 2=M; offer 1 40 A; track 41 1=A 2=M; offer 2 41 N",
+            "track 40 1=A 2=M; offer 1 40 A 0; track 41 1=A 2=M; offer 2 41 N 0",
             [(1, "matched", 1, 40), (2, "matched", 1, 41)],
         ),
         # A car that is also tracked as a van would never be refined, as if it were two objects.
