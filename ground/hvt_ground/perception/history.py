@@ -38,11 +38,8 @@ class History:
     def __post_init__(self) -> None:
         self._frames: dict[int, Picture] = {}
         self._tracks: dict[int, Tracks] = {}
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of the pictures held."""
-        return sum(one.nbytes for one in self._frames.values())
+        self.size_bytes = 0
+        """Bytes of the pictures held; any thread may read it."""
 
     @property
     def oldest_tracked(self) -> int | None:
@@ -62,12 +59,13 @@ class History:
                 f"frame {frame_index} after frame {newest}: frames rise; clear() begins a session"
             )
         self._frames[frame_index] = picture
+        self.size_bytes += picture.nbytes
         while (oldest := next(iter(self._frames))) < frame_index and (
             len(self._frames) > self.max_frames
             or self.size_bytes > self.max_bytes
             or oldest < frame_index - self.reach_frames
         ):
-            del self._frames[oldest]
+            self.size_bytes -= self._frames.pop(oldest).nbytes
 
     def add_tracks(self, tracks: Tracks) -> None:
         """Keep the tracks of a frame, in place of those that it has; frames before all that are held stay out.
@@ -123,6 +121,7 @@ class History:
         """Forget everything: a new session counts its frames from 0 again."""
         self._frames.clear()
         self._tracks.clear()
+        self.size_bytes = 0
 
 
 def as_bgr(picture: Picture) -> Image:

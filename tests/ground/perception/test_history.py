@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -39,6 +41,25 @@ def test_pictures_are_found_as_they_were_and_bounded(bounds, given, kept):
         assert history.size_bytes <= max(bounds.get("max_bytes", DEFAULT_MAX_BYTES), height * ONE // 4)
     found = {index: history.frame(index) for index in range(given[-1][0] + 1)}
     assert {index: one[0, 0, 0] for index, one in found.items() if one is not None} == {k: k for k in kept}
+
+
+def test_their_size_is_read_while_they_come():
+    """A report of another thread ended the session with a RuntimeError."""
+    history, errors, ended = History(), [], threading.Event()
+
+    def read() -> None:
+        while not (errors or ended.is_set()):
+            try:
+                assert history.size_bytes >= 0
+            except RuntimeError as error:
+                errors.append(error)
+
+    (reader := threading.Thread(target=read)).start()
+    for index in range(20_000):
+        history.add_frame(index, picture(0))
+    ended.set()
+    reader.join()
+    assert not errors
 
 
 def listed(frame_index, boxes):
