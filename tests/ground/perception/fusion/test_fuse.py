@@ -360,12 +360,12 @@ def test_two_boxes_of_one_vehicle_count_once(ground):
 
 
 @pytest.mark.parametrize(
-    ("scale", "confidence", "name", "shown"),
-    [(1, 0.4, "bus", 0.6), (1, 0.95, "car", 0.95), (1 / 3, 0.95, "bus", 0.95)],
+    ("finer", "confidence", "name", "shown"),
+    [({}, 0.4, "bus", 0.6), ({}, 0.95, "car", 0.95), ({"base_per_source": 1 / 3}, 0.95, "bus", 0.95)],
 )
-def test_the_class_is_that_of_the_surer_side_and_of_who_saw_it_larger(scale, confidence, name, shown):
+def test_the_class_is_that_of_the_surer_side_and_of_who_saw_it_larger(finer, confidence, name, shown):
     """The edge would be overruled by a blurred base, or never; a truck of ten pixels there is surely called a car."""
-    ground = Ground(base_per_source=scale)
+    ground = Ground(**finer)
     ours, theirs = tracks_at(0, {1: A}), tracks_at(0, {70: A}, class_id=1)
     ours.confidences[:], theirs.confidences[:] = confidence, 0.6
     ground.fusion.take_own(ours)
