@@ -22,11 +22,11 @@ def test_one_on_a_disk_that_was_unmounted_is_noticed(tmp_path):
 
 
 def test_one_that_was_moved_is_there(tmp_path):
-    """To move a flight that is written, or its folder, ended its recording."""
-    path = tmp_path / "now" / "flight.rrd"
-    path.parent.mkdir()
+    """A recording would end because its folder has another name."""
+    (folder := tmp_path / "now").mkdir()
+    path = folder / "flight.rrd"
     with path.open("wb") as file:
-        path.parent.rename(tmp_path / "kept")
+        folder.rename(tmp_path / "kept")
         check_there(file.fileno(), path)
         (tmp_path / "kept" / path.name).unlink()
         with pytest.raises(FileNotFoundError, match="it was removed"):

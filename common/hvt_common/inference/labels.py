@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from hvt_common.errors import UserError, absent
+from hvt_common.errors import UserError, absent, telling
 from hvt_common.files import read_text
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
 from hvt_common.inference.runtimes.model_file import ir_metadata, is_ir, onnx_metadata
@@ -165,12 +165,8 @@ def _read_text(path: Path) -> str:
     if not path.is_file():
         state = "is not a file" if path.exists() else "does not exist"
         raise absent(path)(f"labels file {path} {state}; a text file with one class name a line is expected")
-    try:
+    with telling(f"labels file {path} cannot be read (", "); one class name a line is expected"):
         return read_text(path)
-    except OSError as error:
-        raise UserError(
-            f"labels file {path} cannot be read ({error.strerror}); one class name a line is expected"
-        ) from error
 
 
 def _written_names(text: str) -> tuple[str, ...] | None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from urllib.parse import urlsplit
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 
 
 def is_loopback(host: str) -> bool:
@@ -82,10 +82,8 @@ def check_port(address: str, *, name: str, packages: Sequence[str] = ()) -> None
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and 0 < int(port) < 2**16):
         raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT")
-    try:
+    with telling(f"{name} {address} cannot be listened on (", "): give another"):
         family, *_, where = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(where)
-    except OSError as error:
-        raise UserError(f"{name} {address} cannot be listened on ({error.strerror}): give another") from None

@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read
+from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read, telling
 from hvt_common.files import write_whole
 from hvt_common.runtime.log import STATUS_LOGGER
 from hvt_common.units import shown_text
@@ -151,13 +151,11 @@ def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) 
         return
     real = path.resolve()
     fresh = not real.exists()
-    try:
+    with telling(f"{name} {path} cannot be written (", "): name a file that can"):
         with real.open("ab"):
             pass
         if fresh:
             real.unlink()
-    except OSError as error:
-        raise UserError(f"{name} {path} cannot be written ({error.strerror}): name a file that can") from None
 
 
 def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:

@@ -116,18 +116,13 @@ def test_it_follows_the_scene(caplog):
     assert not search.enlarged
 
 
-def test_a_picture_that_is_searched_in_its_own_pixels_is_left_alone(caplog):
-    """Tiles of tiles would take ten times as long."""
-    large = cv2.resize(picture(200, 5), (1920, 1080), interpolation=cv2.INTER_NEAREST)
-    _, runs, _ = flown([np.asarray(large, np.uint8)] * 5, caplog)
-    assert runs == [1] * 5
-
-
-def test_a_detector_that_fails_in_between_promises_nothing():
-    """The flight would end with its model."""
+def test_a_detector_that_fails_or_a_large_picture_changes_nothing(caplog):
+    """A failing detector would have each picture searched in parts, or a picture in its own pixels be enlarged."""
     search = ScaleSearch(lambda _: None, confidence=0.4)
     assert len(search.take(Detections.none(), picture(200, 5))) == 0
     assert not search.enlarged
+    large = cv2.resize(picture(200, 5), (1920, 1080), interpolation=cv2.INTER_NEAREST)
+    assert flown([np.asarray(large, np.uint8)] * 5, caplog)[1] == [1] * 5
 
 
 def test_a_large_object_is_found_reduced_and_its_parts_are_none(caplog):

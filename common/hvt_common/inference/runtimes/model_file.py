@@ -16,7 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree as ET
 
-from hvt_common.errors import UserError, absent
+from hvt_common.errors import UserError, absent, telling
 from hvt_common.files import read_text
 from hvt_common.units import SECOND_NS
 
@@ -73,13 +73,11 @@ def check_onnx_file(path: Path) -> None:
         raise absent(path)(f"model {path} does not exist; an ONNX file is expected")
     if not path.is_file():
         raise UserError(f"model {path} is not a file; an ONNX file is expected")
-    try:
+    with telling(f"model {path} cannot be read: "):
         status = path.stat()
         young = time.time_ns() - status.st_mtime_ns < _YOUNG_NS
         check = _check_file.__wrapped__ if young else _check_file
         check(path, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
-    except OSError as error:
-        raise UserError(f"model {path} cannot be read: {error.strerror}") from error
 
 
 def opset_versions(path: Path) -> dict[str, int]:
@@ -253,11 +251,8 @@ def check_ir_file(path: Path) -> None:
     for part, most in ((path, _MAX_XML_BYTES), (weights, MAX_MODEL_BYTES)):
         if part.stat().st_size > most:
             raise UserError(f"model {part} has {part.stat().st_size} bytes; at most {most} are accepted")
-    try:
-        with path.open("rb") as file:
-            begin = file.read(_FIRST_BYTES)
-    except OSError as error:
-        raise UserError(f"model {path} cannot be read: {error.strerror}") from error
+    with telling(f"model {path} cannot be read: "), path.open("rb") as file:
+        begin = file.read(_FIRST_BYTES)
     if b"<net" not in begin or b"<!DOCTYPE" in begin or b"<!ENTITY" in begin:
         raise UserError(f"model {path} is not an OpenVINO model (it begins with no <net>)")
 
