@@ -160,7 +160,6 @@ class StaleSockets:
         self._first: dict[int, tuple[bytes, int]] = {}
         """What waits first at each UDP listener, and for how many checks."""
         self._next_deaf_s = 0.0
-        self._deaf: set[str] = set()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-sockets", daemon=True)
 
@@ -187,7 +186,7 @@ class StaleSockets:
                 self._check(time.monotonic())
 
     def _check(self, now_s: float) -> None:
-        if self._deaf_ports and now_s >= self._next_deaf_s:
+        if now_s >= self._next_deaf_s:
             self._next_deaf_s = now_s + _DEAF_EVERY_S
             self.check_listeners()
         own = self._zenohs()
@@ -221,8 +220,8 @@ class StaleSockets:
 
     def check_listeners(self) -> None:
         """Say of a listener that it hears nothing any more; call it about once a second."""
-        if self._deaf and self._on_deaf is not None:
-            return  # another session is on its way
+        if self._on_deaf is None or not self._deaf_ports:
+            return
         deaf, before, self._first = set(), self._first, {}
         interfaces = {0, *(index for index, _ in socket.if_nameindex())}
         for inode, fd in own_sockets().items():
@@ -238,15 +237,11 @@ class StaleSockets:
                     if self._first[inode][1] >= _DEAF_CHECKS:
                         why = "is not read any more, as may happen to a program that was stopped for some seconds"
                         deaf.add(f"what comes to udp {end} {why}")
-        if deaf and not self._deaf:
-            remedy = "restart it" if self._on_deaf is None else "the link is made anew"
-            self._failures.failed(_LISTENER, f"{', '.join(sorted(deaf))}: {remedy}", last=True)
-            if self._on_deaf is not None:
-                self._free_ports()
-                self._on_deaf()
-        elif self._deaf and not deaf:
-            self._failures.works(_LISTENER)
-        self._deaf = deaf
+        if deaf:
+            self._failures.failed(_LISTENER, f"{', '.join(sorted(deaf))}: the link is made anew", last=True)
+            self._free_ports()
+            self._on_deaf()
+            self._on_deaf = None
 
     def _free_ports(self) -> None:
         # Zenoh cannot close a session whose listener stands still, and the next one could not listen: leave it
