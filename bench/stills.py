@@ -27,11 +27,10 @@ from bench.support.material import FPS, SIZE, data, frames
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.values import Image, View
-from hvt_common.video.base_crop import base_crop, coded_size
+from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db, still_codec, still_codec_names
 from hvt_edge.perception.candidates import PADDING, crop_box
-from hvt_edge.stills.maker import MAX_SIDE_PX
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 

@@ -11,7 +11,7 @@ from functools import cache
 from hvt_common.protocol.messages import MAX_MISSING_BASE, ControlRequest, Feedback, Flags, WireError
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.rate_control import RateController
 from hvt_ground.link.reassemble import REORDER_UNITS, RESEND_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
@@ -112,7 +112,7 @@ def _command_seeds() -> list[bytes]:
 
 
 def _reports(data: bytes) -> None:
-    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    pacer = Pacer(RateController(ceiling_bps=800_000, floor_bps=100_000))
     primary, inbox, now_ns = PrimaryReceiver(), FeedbackInbox(), 1_790_000_000_000 * _MS
     for n in range(60):
         pacer.sent_base(n, 5000, now_ns=now_ns + n * 66 * _MS, keyframe=n == 0)

@@ -173,7 +173,6 @@ class Backfill:
         return None
 
     def take_back(self, chunk: Chunk) -> None:
-        """Note that this chunk was not sent after all."""
         transfer = self.line.get(chunk.key)
         if transfer is not None:
             transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)

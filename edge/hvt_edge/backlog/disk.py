@@ -25,7 +25,6 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from hvt_common.protocol.messages import (
@@ -282,9 +281,7 @@ class Store:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     def _ranked(self, kind: BacklogKind, order: str = "DESC") -> Iterator[Entry]:

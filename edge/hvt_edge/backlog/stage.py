@@ -285,7 +285,6 @@ class BacklogStage:
     # Reports
 
     def on_feedback(self, feedback: Feedback, *, now_ns: int) -> None:
-        """A ground has reported on this session (any thread)."""
         named = feedback.base_sequence
         # After the last frame no later one can show that an earlier one was lost.
         sent = named if self._finishing else self._line.base_sequence

@@ -40,7 +40,6 @@ import numpy.typing as npt
 from hvt_common.units import SECOND_NS
 
 BASE_ATTACHMENT_BYTES = 44
-"""The largest `BaseHeader`."""
 _MEMORY_WINDOWS = 5
 """Windows of the base's recent behaviour that the forecast looks back on."""
 _LEFT_WINDOWS = 3
@@ -88,7 +87,6 @@ class BudgetSettings:
     base_bps: int
     """B_v, the share of the base stream with its headers, overhead and ``status``."""
     fps: float
-    """Coded frames a second."""
     window_ns: int = SECOND_NS
     carry_s: float = 2.0
     metadata_bps: int = 0
@@ -119,27 +117,21 @@ class VideoLoan:
     def __init__(self, window_ns: int) -> None:
         self._window_ns = window_ns
         self._wanted: tuple[int, int] | None = None
-        """(line bytes, time of the first request)."""
         self._taken: deque[tuple[int, int]] = deque()
         """(time, line bytes) of the requested stills of the last window."""
         self._due = 0.0
         """Fraction of a frame that is due to be left out since the last one was."""
 
-    def want(self, line_bytes: int, *, now_ns: int) -> None:
-        """A requested still of about ``line_bytes`` waits for room; a repeated call only updates the size."""
+    def want(self, line_bytes: int | None, *, now_ns: int) -> None:
+        """A requested still of about ``line_bytes`` waits; a repeated call updates the size. None: none waits."""
         since_ns = now_ns if self._wanted is None else self._wanted[1]
-        self._wanted = line_bytes, since_ns
-
-    def withdraw(self) -> None:
-        self._wanted = None
+        self._wanted = None if line_bytes is None else (line_bytes, since_ns)
 
     def take(self, line_bytes: int, *, now_ns: int) -> None:
-        """Note a requested still that is sent."""
         self._wanted = None
         self._taken.append((now_ns, line_bytes))
 
     def left_bytes(self, window_bytes: float, *, now_ns: int) -> float:
-        """Bytes that requested stills may still take of the window that ends now."""
         return _MOST_SHARE * window_bytes - self._taken_bytes(now_ns)
 
     def waits(self, window_bytes: float, *, now_ns: int) -> bool:
@@ -221,15 +213,6 @@ class RollingBudget:
         self._note_bursts()
         self._cap = settings.still_bps * settings.carry_s / 8
 
-    def set_base(self, base_bps: int, fps: float, *, now_ns: int) -> None:
-        """The base stream continues at another rate, from its next coded frame (a keyframe) on."""
-        self._refill(now_ns)
-        until_ns = max(now_ns, self._last_ns) + self._settings.window_ns
-        self._old_peak = (until_ns, max(self._base_peak, self._peak_at(now_ns)))
-        self._used.clear()
-        self._adopt(replace(self._settings, base_bps=base_bps, fps=fps))
-        self._tokens = min(self._cap, self._tokens)
-
     def set_total(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
         """Another total from now on. The base stream's rate may stay above it until x265 is opened anew.
 
@@ -242,8 +225,14 @@ class RollingBudget:
             self._settings = replace(settings, total_bps=total_bps)
             self._total = total_bps * settings.window_ns / 8 / SECOND_NS
             self._events = [(at_ns, self._counted(size, then_bps)) for at_ns, size, then_bps in self._sent]
-            if (base_bps, fps) != (settings.base_bps, settings.fps):
-                self.set_base(base_bps, fps, now_ns=now_ns)
+            if (base_bps, fps) != (
+                settings.base_bps,
+                settings.fps,
+            ):  # from the next coded frame, a keyframe, on
+                until_ns = max(now_ns, self._last_ns) + settings.window_ns
+                self._old_peak = (until_ns, max(self._base_peak, self._peak_at(now_ns)))
+                self._used.clear()
+                self._adopt(replace(self._settings, base_bps=base_bps, fps=fps))
             self._cap = self._settings.still_bps * settings.carry_s / 8
             self._tokens = min(self._cap, self._tokens)
 
@@ -305,8 +294,7 @@ class RollingBudget:
 
         Another thread may have sent since a still or a chunk was admitted, and taken its room.
         """
-        after_ns = now_ns - self._settings.window_ns
-        return line_bytes + sum(size for at_ns, size in self._events if at_ns > after_ns) <= self._total
+        return line_bytes + self._spent(self._events, now_ns) <= self._total
 
     def resend_ns(self, line_bytes: int, *, now_ns: int) -> int | None:
         """Return when a base message may be sent again (`earliest_ns`); None beyond the share of such messages."""
@@ -389,8 +377,7 @@ class RollingBudget:
     def _requested_free(self, now_ns: int, events: _Events | None = None) -> float:
         self._note_query(now_ns)
         events = self._events if events is None else events
-        spent = sum(size for at_ns, size in events if at_ns > now_ns - self._settings.window_ns)
-        free = self._total - spent - self._spare
+        free = self._total - self._spent(events, now_ns) - self._spare
         return free if self._settings.yields else min(free, self._window_allowance(now_ns, events))
 
     def _note_used(self, now_ns: int) -> None:
@@ -419,10 +406,7 @@ class RollingBudget:
 
     def want_requested(self, line_bytes: int | None, *, now_ns: int) -> None:
         """A requested still of about ``line_bytes`` waits for its room; None: none waits any more."""
-        if line_bytes is None:
-            self._loan.withdraw()
-        else:
-            self._loan.want(line_bytes, now_ns=now_ns)
+        self._loan.want(line_bytes, now_ns=now_ns)
 
     def yielding(self, now_ns: int) -> bool:
         """Whether a requested still waits for which frames are left out: the room that they free belongs to it."""
@@ -479,6 +463,9 @@ class RollingBudget:
         while self._events[0][0] <= oldest_ns:
             del self._events[0], self._sent[0]
 
+    def _spent(self, events: _Events, now_ns: int) -> int:
+        return sum(size for at_ns, size in events if at_ns > now_ns - self._settings.window_ns)
+
     def _counted(self, line_bytes: int, then_bps: int) -> int:
         if self._settings.window_ns <= _WHOLE_NS:
             return line_bytes
@@ -523,9 +510,7 @@ class RollingBudget:
         beside = self._settings.metadata_bps / 8 / SECOND_NS * ahead_ns
         return float((unspent - (self._burst if burst is None else burst) - beside).min())
 
-    def _unspent(
-        self, now_ns: int, events: _Events | None = None
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    def _unspent(self, now_ns: int, events: _Events | None = None) -> tuple[_Floats, npt.NDArray[np.int64]]:
         # The fullest windows end with a base frame: the window of the ``k``-th from now holds past bytes younger than
         # the window less the time until then, and ``k`` forecast frames. The first, ``k`` = 0, also holds messages
         # recorded for later, so the room is never more than any window has.

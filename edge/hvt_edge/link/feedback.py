@@ -21,7 +21,6 @@ class Report:
 
     feedback: Feedback
     now_ns: int
-    """When it came, by the edge's clock."""
     primary: bool
     """It is new and comes from the ground that steers."""
     first: bool = False
@@ -46,7 +45,6 @@ class PrimaryReceiver:
         """The highest base and still sequences that it has named."""
         self._reported_ns = 0
         self._progress_ns = 0
-        """When it last named something new."""
 
     def judge(self, feedback: Feedback, *, sent: tuple[int, int], now_ns: int) -> Report:
         """Decide on a report; ``sent`` are the last sequences of base and stills that went out.
@@ -124,7 +122,6 @@ class FeedbackInbox:
         self._base_messages = 0
         self._roi_messages = 0
         self.received_ns: int | None = None
-        """When the last report came, by the edge's clock."""
 
     def on_report(self, report: Report) -> None:
         """Process one report of any ground (any thread)."""

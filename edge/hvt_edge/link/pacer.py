@@ -45,7 +45,7 @@ get video at the least rate, since behind a router the link may be gone all the 
 _LATE_NS = 3 * SECOND_NS
 """Where all named messages have come late for this long, the path is longer than it was."""
 _MEMORY_NS = 15 * SECOND_NS
-"""The shortest round trip counts for this long, up to twice as long."""
+"""What was measured counts for this long."""
 _MOST_RECORDS = 1024
 _RESEND_NS = SECOND_NS
 """An older access unit is not sent again: a keyframe has been requested by then."""
@@ -100,24 +100,29 @@ class Flight:
         """Line bytes of base and stills that no report has named yet."""
         return sum(one.line_bytes for one in self._base) + sum(size for _, _, size in self._stills)
 
-    def sent_base(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
-        self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
-        self._messages += 1
-        self._last = (sequence, self._last[1])
-        serialization_ns = self.backlog_ns(now_ns=now_ns, rate_bps=rate_bps)
-        self._base.append(
-            Sent(sequence, now_ns, serialization_ns, line_bytes, self._total_bytes, self._messages)
-        )
-
-    def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
-        self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
-        self._messages += 1
-        self._last = (self._last[0], sequence)
-        self._stills.append((sequence, now_ns, line_bytes))
-
-    def sent_other(self, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
-        """Count a message that no report names."""
-        self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
+    def sent(
+        self,
+        line_bytes: int,
+        *,
+        now_ns: int,
+        rate_bps: int,
+        base: int | None = None,
+        still: int | None = None,
+    ) -> None:
+        """Count a base message or a still of this sequence, or a message that no report names."""
+        self._drain(now_ns, rate_bps)
+        self._backlog_bytes += line_bytes
+        self._total_bytes += line_bytes
+        self._messages += base is not None or still is not None
+        if still is not None:
+            self._last = (self._last[0], still)
+            self._stills.append((still, now_ns, line_bytes))
+        if base is not None:
+            self._last = (base, self._last[1])
+            serialization_ns = self.backlog_ns(now_ns=now_ns, rate_bps=rate_bps)
+            self._base.append(
+                Sent(base, now_ns, serialization_ns, line_bytes, self._total_bytes, self._messages)
+            )
 
     def backlog_ns(self, *, now_ns: int, rate_bps: int) -> int:
         """The time that a link of this rate still needs for the bytes in flight."""
@@ -152,16 +157,10 @@ class Flight:
         self._given_up.extend(given_up)
 
     def clear(self) -> None:
-        """Forget messages in flight: they are lost."""
         self._given_up.clear()
         self._base.clear()
         self._stills.clear()
         self._backlog_bytes = 0.0
-
-    def _add(self, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
-        self._drain(now_ns, rate_bps)
-        self._backlog_bytes += line_bytes
-        self._total_bytes += line_bytes
 
     def _drain(self, now_ns: int, rate_bps: int) -> None:
         # Two threads send, with times that may differ a little: time never goes back.
@@ -221,7 +220,6 @@ class BaseInFlight:
             return unit if useful and not on_its_way else None
 
     def resent(self, sequence: int, *, now_ns: int) -> None:
-        """Note that the unit is sent again."""
         with self._lock:
             if sequence in self._units:
                 self._resent[sequence] = now_ns
@@ -256,7 +254,7 @@ class Pacer:
         self._progress_ns = 0
         """When it last named a base message in flight."""
         self._held_ns = _FIRST_HELD_NS
-        self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
+        self._round_trip, self._return = LeastDelay(), LeastDelay()
         self.round_trip_ns = SECOND_NS // 2
         """Shortest time from sending a message to its report; half a second until one was measured."""
         self._return_ns = 0
@@ -271,10 +269,9 @@ class Pacer:
         self._doubted: int | None = None
         """The first message sent as a probe, until a report tells whether the overdue one is lost."""
         self._doubt_ns = self._open_ns = 0
-        """When the probe was sent, and the last report that did not tell."""
         self._late_since_ns: int | None = None
         """Since when all named messages came late; `_late` is the shortest round trip of messages sent since then."""
-        self._late = LeastDelay(_MEMORY_NS)
+        self._late = LeastDelay()
         self._last_sent_ns = self._last_bytes = 0
         self._linked: bool | None = None
         self._reports = True
@@ -285,7 +282,6 @@ class Pacer:
 
     @property
     def rate_bps(self) -> int:
-        """The total rate that may be sent, line bits a second."""
         return self._controller.rate_bps
 
     @property
@@ -295,7 +291,6 @@ class Pacer:
 
     @property
     def measures(self) -> bool:
-        """Whether a round trip to the present receiver was measured."""
         return not self._round_trip.empty
 
     def measured_now(self, now_ns: int) -> bool:
@@ -328,16 +323,16 @@ class Pacer:
                 self._probed = self._flight.oldest.sequence
                 if self._doubted is None:
                     self._doubted, self._doubt_ns = sequence, now_ns
-            self._flight.sent_base(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
+            self._flight.sent(line_bytes, now_ns=now_ns, rate_bps=self.rate_bps, base=sequence)
 
     def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int) -> None:
         with self._lock:
-            self._flight.sent_still(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
+            self._flight.sent(line_bytes, now_ns=now_ns, rate_bps=self.rate_bps, still=sequence)
 
     def sent_other(self, line_bytes: int, *, now_ns: int) -> None:
         """Count status, tracks or a still that is sent again: no report names them."""
         with self._lock:
-            self._flight.sent_other(line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
+            self._flight.sent(line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
     # Reports
 
@@ -504,7 +499,7 @@ class Pacer:
 
     def _forget_path(self) -> None:
         self._held_ns = _FIRST_HELD_NS
-        self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
+        self._round_trip, self._return = LeastDelay(), LeastDelay()
         self.round_trip_ns = SECOND_NS // 2
         self._controller.forget_path()
 
@@ -514,7 +509,7 @@ class Pacer:
         if longer_ns <= 0:
             return False
         round_trip_ns = min(now_ns - sent.sent_ns, self.round_trip_ns + longer_ns)
-        self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
+        self._round_trip, self._return = LeastDelay(), LeastDelay()
         self._round_trip.add(round_trip_ns, now_ns=now_ns)
         return True
 
@@ -523,7 +518,7 @@ class Pacer:
         if self._late_ns(sent, now_ns) - held_ns <= _SLACK_NS:
             self._late_since_ns = None
         elif self._late_since_ns is None:
-            self._late_since_ns, self._late = now_ns, LeastDelay(_MEMORY_NS)
+            self._late_since_ns, self._late = now_ns, LeastDelay()
         elif sent.sent_ns >= self._late_since_ns:
             least_ns = self._late.add(now_ns - sent.sent_ns, now_ns=now_ns)
             if now_ns - self._late_since_ns >= _LATE_NS:

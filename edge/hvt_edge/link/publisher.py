@@ -195,7 +195,6 @@ class EdgeListener:
         self._token = self.session.liveliness().declare_token(self.keys[Channel.ALIVE])
 
     def close(self) -> None:
-        """Withdraw the token, so that grounds see the end."""
         self._token.undeclare()  # type: ignore[no-untyped-call]
 
     def declare_again(self, *, there: bool) -> None:

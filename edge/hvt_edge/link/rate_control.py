@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS
 
@@ -41,31 +41,22 @@ _LITTLE_OFF = 0.02
 _REST_NS = 1_500 * _MS
 """Least time between two openings; a third of it where the rate is higher by `_FAR_MORE`: it grows in steps."""
 _FAR_MORE = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class RateSettings:
-    """Rates in line bits a second, times in nanoseconds."""
-
-    ceiling_bps: int
-    floor_bps: int
-    excess_ns: int = 80 * _MS
-    """Overuse begins here; on thin links at two large packets."""
-    verdict_ns: int = 300 * _MS
-    """The excess must stay high for this time, and over `verdict_reports`."""
-    verdict_reports: int = 3
-    backoff: float = 0.85
-    """Factor on the arrival rate after overuse."""
-    plateau_ns: int = 2_600 * _MS
-    """Time of the growth back to the rate of the last breakdown."""
-    beyond_per_s3: float = 0.008
-    """Growth beyond it, as a share of that rate, by the third power of the seconds."""
-    resume_ns: int = 3 * SECOND_NS
-    """Time of the growth back to the former rate after the link was gone."""
-    most_loss: float = 0.12
-    """Share of lost messages; less counts as the link's nature, and only slows growth down."""
-    memory_ns: int = 15 * SECOND_NS
-    """Window of the least delay: a route that became longer does not count as a queue for ever."""
+_EXCESS_NS = 80 * _MS
+"""Overuse begins here; on thin links at two large packets."""
+_VERDICT_NS, _VERDICT_REPORTS = 300 * _MS, 3
+"""The excess must stay high for this time, and over so many reports."""
+_BACKOFF = 0.85
+"""Factor on the arrival rate after overuse."""
+_PLATEAU_NS = 2_600 * _MS
+"""Time of the growth back to the rate of the last breakdown."""
+_BEYOND_PER_S3 = 0.008
+"""Growth beyond it, as a share of that rate, by the third power of the seconds."""
+_RESUME_NS = 3 * SECOND_NS
+"""Time of the growth back to the former rate after the link was gone."""
+_MOST_LOSS = 0.12
+"""Share of lost messages; less counts as the link's nature, and only slows growth down."""
+_MEMORY_NS = 15 * SECOND_NS
+"""Window of the least delay: a route that became longer does not count as a queue for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +85,13 @@ class Progress:
 class LeastDelay:
     """The least of the last ``memory_ns`` to twice that long, in constant memory."""
 
-    def __init__(self, memory_ns: int) -> None:
+    def __init__(self, memory_ns: int = _MEMORY_NS) -> None:
         self._memory_ns = memory_ns
         self._since_ns: int | None = None
         self._former: int | None = None
         self._least: int | None = None
 
     def add(self, delay_ns: int, *, now_ns: int) -> int:
-        """Add one delay; return the least."""
         if self._since_ns is None or now_ns - self._since_ns >= self._memory_ns:
             self._former, self._least, self._since_ns = self._least, None, now_ns
         self._least = delay_ns if self._least is None else min(self._least, delay_ns)
@@ -113,15 +103,14 @@ class LeastDelay:
 
 
 class LossCount:
-    """Tells whether more than ``most_share`` of the newest messages are lost, at any frame rate.
+    """Tells whether more than `_MOST_LOSS` of the newest messages are lost, at any frame rate.
 
     It counts messages, not seconds: the newest 100, however long these took. For 100 the share is used as measured.
     For 20 to 99, two standard deviations of the binomial distribution more must be lost than a link of just
-    ``most_share`` would lose; at 12 % that means 6 of 20, or 11 of 50. Fewer than 20 say nothing.
+    that share would lose; at 12 % that means 6 of 20, or 11 of 50. Fewer than 20 say nothing.
     """
 
-    def __init__(self, most_share: float) -> None:
-        self._most_share = most_share
+    def __init__(self) -> None:
         self._counts: deque[tuple[int, int]] = deque()
         """(messages, lost of them) by report."""
         self._marked: tuple[int, int] | None = None
@@ -143,10 +132,9 @@ class LossCount:
 
     def lasts(self) -> bool:
         """Whether the share lost since `mark`, as measured, is too high."""
-        return self._marked is None or self._share_since(self._marked) > self._most_share
+        return self._marked is None or self._share_since(self._marked) > _MOST_LOSS
 
     def mark(self) -> None:
-        """Note that the rate falls for this loss."""
         self._marked = self._counts[-1]
 
     def clear(self) -> None:
@@ -173,86 +161,71 @@ class LossCount:
         messages, lost = self._since(first)
         if messages < _FEW_MESSAGES:
             return 0
-        share, doubt = self._most_share, 0.0
+        doubt = 0.0
         if messages < _LOSS_MESSAGES:
-            doubt = _LOSS_DEVIATIONS * math.sqrt(share * (1 - share) * messages)
-        more = lost - share * messages
+            doubt = _LOSS_DEVIATIONS * math.sqrt(_MOST_LOSS * (1 - _MOST_LOSS) * messages)
+        more = lost - _MOST_LOSS * messages
         return (more > doubt) - (more < -doubt)
 
 
-@dataclass(frozen=True, slots=True)
-class _Judged:
-    progress: Progress
-    excess_ns: int
-
-
 class RateController:
-    """Controls the rate between floor and ceiling. Deterministic, time is an argument; not thread-safe."""
+    """Controls the rate between floor and ceiling, line bits a second. Deterministic; not thread-safe."""
 
-    def __init__(self, settings: RateSettings) -> None:
-        assert 0 < settings.floor_bps <= settings.ceiling_bps
-        self._settings = settings
-        self._rate = float(settings.ceiling_bps)
-        self._least = LeastDelay(settings.memory_ns)
+    def __init__(self, *, ceiling_bps: int, floor_bps: int) -> None:
+        assert 0 < floor_bps <= ceiling_bps
+        self._ceiling_bps, self._floor_bps = ceiling_bps, floor_bps
+        self._rate = float(ceiling_bps)
+        self._least = LeastDelay()
         self._base_ns: int | None = None
-        self._recent: deque[_Judged] = deque(maxlen=64)
+        self._recent: deque[tuple[Progress, int]] = deque(maxlen=64)
+        """Reports that were judged, and their excess (ns)."""
         self._judge_from_ns = -(2**63)
         """Only messages sent after this time say something about the present rate."""
-        self._cubic_max = self._low = float(settings.ceiling_bps)
-        self._plateau_ns = settings.plateau_ns
+        self._cubic_max = self._low = float(ceiling_bps)
+        self._plateau_ns = _PLATEAU_NS
         self._curve_ns = 2**62
         """Time along the curve of growth; only time without signs of congestion counts."""
         self._last_ns: int | None = None
         self._silent = False
-        self._losses = LossCount(settings.most_loss)
+        self._losses = LossCount()
         self._next_loss_ns = 0
         self.backoffs = 0
         """How often the rate was lowered."""
 
     @property
     def rate_bps(self) -> int:
-        """The rate that may be sent now, line bits a second."""
-        settings = self._settings
-        return round(min(settings.ceiling_bps, max(settings.floor_bps, self._rate)))
+        return round(min(self._ceiling_bps, max(self._floor_bps, self._rate)))
 
     @property
     def steady_bps(self) -> int:
         """The rate that is likely to last, for slow followers: near the last breakdown, a little below it."""
-        if self._rate >= self._settings.ceiling_bps or self._rate > 1.15 * self._cubic_max:
+        if self.at_ceiling or self._rate > 1.15 * self._cubic_max:
             return self.rate_bps
-        return min(self.rate_bps, max(self._settings.floor_bps, round(0.9 * self._cubic_max)))
+        return min(self.rate_bps, max(self._floor_bps, round(0.9 * self._cubic_max)))
 
     @property
     def at_ceiling(self) -> bool:
-        """Whether the rate is the ceiling, and so will stay."""
-        return self._rate >= self._settings.ceiling_bps
-
-    @property
-    def excess_ns(self) -> int:
-        """Excess delay of the newest report; negative where the link has room."""
-        return self._recent[-1].excess_ns if self._recent else 0
+        return self._rate >= self._ceiling_bps
 
     def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
         """Set another ceiling. A rate at the old ceiling moves to the new one; a lower rate grows as before."""
-        old = self._settings
-        at_ceiling = self._rate >= old.ceiling_bps
-        floor = min(ceiling_bps, old.floor_bps if floor_bps is None else floor_bps)
-        self._settings = replace(old, ceiling_bps=ceiling_bps, floor_bps=floor)
-        if at_ceiling or self._rate > ceiling_bps:
+        if self.at_ceiling or self._rate > ceiling_bps:
             self._rate = self._cubic_max = float(ceiling_bps)
+        self._floor_bps = min(ceiling_bps, self._floor_bps if floor_bps is None else floor_bps)
+        self._ceiling_bps = ceiling_bps
 
-    def on_progress(self, progress: Progress) -> int:
-        """Process one report that names a message for the first time; return the rate."""
+    def on_progress(self, progress: Progress) -> None:
+        """Process one report that names a message for the first time."""
         step_ns = self._elapsed(progress.now_ns)
         excess_ns = self._excess(progress)
         if progress.sent_ns < self._judge_from_ns:
-            return self.rate_bps
+            return
         self._silent = False
-        self._recent.append(_Judged(progress, excess_ns))
+        self._recent.append((progress, excess_ns))
         self._losses.add(progress.messages, progress.lost)
         limit_ns = self._limit_ns()
         if self._overused(limit_ns):
-            self._back_off(progress, self._settings.backoff * min(self._rate, self._arriving_bps()))
+            self._back_off(progress, _BACKOFF * min(self._rate, self._arriving_bps()))
         elif self._losses.exceeds():
             if progress.now_ns >= self._next_loss_ns and self._losses.lasts():
                 self._next_loss_ns = progress.now_ns + _LOSS_EVERY_NS
@@ -260,25 +233,23 @@ class RateController:
                 self._back_off(progress, self._rate * (1 - self._losses.share / 2))
         elif excess_ns < limit_ns // 2:
             self._grow(step_ns // 2 if self._losses.share > _SOME_LOSS else step_ns)
-        return self.rate_bps
 
-    def on_silence(self, now_ns: int) -> int:
+    def on_silence(self, now_ns: int) -> None:
         """Reports have stopped: the rate falls to the floor. When they return it nears the former rate quickly."""
         if not self._silent:
             self._silent = True
             if self._curve_ns >= self._plateau_ns:  # else it is still on its way back
                 self._cubic_max = self._rate
-            self._rate = self._low = float(self._settings.floor_bps)
-            self._curve_ns, self._plateau_ns = 0, self._settings.resume_ns
+            self._rate = self._low = float(self._floor_bps)
+            self._curve_ns, self._plateau_ns = 0, _RESUME_NS
             self.backoffs += 1
             self._losses.clear()  # losses while a link is away are no property of it
             self._start_over(now_ns)
         self._last_ns = now_ns
-        return self.rate_bps
 
     def forget_path(self) -> None:
         """The receiver or the transport has changed: earlier delays say nothing."""
-        self._least = LeastDelay(self._settings.memory_ns)
+        self._least = LeastDelay()
         self._recent.clear()
         self._losses.clear()
 
@@ -296,40 +267,39 @@ class RateController:
         return delay_ns - self._base_ns - progress.serialization_ns
 
     def _limit_ns(self) -> int:
-        return max(self._settings.excess_ns, round(2 * _MTU_BITS * SECOND_NS / self._rate))
+        return max(_EXCESS_NS, round(2 * _MTU_BITS * SECOND_NS / self._rate))
 
-    def _verdict(self) -> list[_Judged]:
+    def _verdict(self) -> list[tuple[Progress, int]]:
         # The newest judged reports, as few as suffice for a verdict; empty where there are too few.
-        chosen: list[_Judged] = []
-        for one in reversed(self._recent):
-            chosen.append(one)
-            span_ns = chosen[0].progress.arrived_ns - one.progress.arrived_ns
-            if len(chosen) >= self._settings.verdict_reports and span_ns >= self._settings.verdict_ns:
-                return chosen[::-1]
+        chosen: list[tuple[Progress, int]] = []
+        for one, excess_ns in reversed(self._recent):
+            chosen.insert(0, (one, excess_ns))
+            span_ns = chosen[-1][0].arrived_ns - one.arrived_ns
+            if len(chosen) >= _VERDICT_REPORTS and span_ns >= _VERDICT_NS:
+                return chosen
             # Where the link has fallen far, few messages arrive and each is later than the last: two of them suffice.
-            if len(chosen) == 2 and span_ns >= _GRAVE_SPAN_NS and one.excess_ns > _GRAVE * self._limit_ns():
-                return chosen[::-1]
+            if len(chosen) == 2 and span_ns >= _GRAVE_SPAN_NS and excess_ns > _GRAVE * self._limit_ns():
+                return chosen
         return []
 
     def _overused(self, limit_ns: int) -> bool:
-        chosen = self._verdict()
-        if not chosen or min(one.excess_ns for one in chosen) <= limit_ns:
+        excesses_ns = [excess_ns for _, excess_ns in self._verdict()]
+        if min(excesses_ns, default=0) <= limit_ns:
             return False
-        return chosen[-1].excess_ns >= chosen[0].excess_ns - limit_ns // 4  # else the queue empties: wait
+        return excesses_ns[-1] >= excesses_ns[0] - limit_ns // 4  # else the queue empties: wait
 
     def _arriving_bps(self) -> float:
         # The arrival rate while the queue stood: the link's capacity.
         chosen = self._verdict() or list(self._recent)
-        return _arrival_bps(chosen[0].progress, chosen[-1].progress) or self._rate
+        return _arrival_bps(chosen[0][0], chosen[-1][0]) or self._rate
 
     def _back_off(self, progress: Progress, rate: float) -> None:
         broke_bps = min(self._rate, self._arriving_bps())
         again = 0.85 * self._cubic_max < broke_bps < 1.15 * self._cubic_max
-        self._rate = max(rate, self._rate / 10, self._settings.floor_bps)
+        self._rate = max(rate, self._rate / 10, self._floor_bps)
         self._cubic_max, self._low, self._curve_ns = max(self._rate, broke_bps), self._rate, 0
         # At a link that breaks down at the same rate again and again growth is slower.
-        least_ns = self._settings.plateau_ns
-        self._plateau_ns = min(2 * least_ns, self._plateau_ns * 13 // 10) if again else least_ns
+        self._plateau_ns = min(2 * _PLATEAU_NS, self._plateau_ns * 13 // 10) if again else _PLATEAU_NS
         self.backoffs += 1
         self._start_over(progress.now_ns)
 
@@ -338,9 +308,8 @@ class RateController:
         self._recent.clear()
 
     def _grow(self, step_ns: int) -> None:
-        settings = self._settings
-        if self._rate >= settings.ceiling_bps:
-            self._rate = float(settings.ceiling_bps)
+        if self.at_ceiling:
+            self._rate = float(self._ceiling_bps)
             return
         curve_ns = self._curve_ns + step_ns
         wanted = self._on_curve(curve_ns)
@@ -349,26 +318,24 @@ class RateController:
         proven = max(2 * self._lately_bps(), min(self._cubic_max, self._delivery_bps()))
         if wanted <= proven:
             self._curve_ns = curve_ns
-        self._rate = min(float(settings.ceiling_bps), max(self._rate, min(wanted, proven)))
+        self._rate = min(float(self._ceiling_bps), max(self._rate, min(wanted, proven)))
 
     def _on_curve(self, curve_ns: int) -> float:
         if curve_ns < self._plateau_ns:
             left = 1 - curve_ns / self._plateau_ns
             return self._cubic_max - (self._cubic_max - self._low) * left**3
         beyond_s = (curve_ns - self._plateau_ns) / SECOND_NS
-        return self._cubic_max * (1 + self._settings.beyond_per_s3 * beyond_s**3)
+        return self._cubic_max * (1 + _BEYOND_PER_S3 * beyond_s**3)
 
     def _delivery_bps(self) -> float:
         # The highest rate that one message of about the last second has proved.
-        last_ns = self._recent[-1].progress.arrived_ns
-        of_late = (one.progress for one in self._recent if last_ns - one.progress.arrived_ns <= SECOND_NS)
-        return max(one.delivery_bps for one in of_late)
+        last_ns = self._recent[-1][0].arrived_ns
+        return max(one.delivery_bps for one, _ in self._recent if last_ns - one.arrived_ns <= SECOND_NS)
 
     def _lately_bps(self) -> float:
         # The arrival rate of about the last second; half the rate if it is not known yet.
-        last = first = self._recent[-1].progress
-        for one in reversed(self._recent):
-            first = one.progress
+        last = first = self._recent[-1][0]
+        for first, _ in reversed(self._recent):
             if last.arrived_ns - first.arrived_ns >= SECOND_NS:
                 break
         if last.arrived_ns - first.arrived_ns < SECOND_NS // 2:
@@ -406,5 +373,4 @@ class ReconfigurationTrigger:
         return much or now_ns - self._off_ns >= _SOME_NS
 
     def done(self, now_ns: int) -> None:
-        """x265 was opened anew."""
         self._done_ns, self._off_ns = now_ns, None

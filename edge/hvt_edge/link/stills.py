@@ -76,10 +76,6 @@ class Alternative:
             for mine, limit in zip(errors, self.limits, strict=True)
         )
 
-    def loses_to(self, still: Image, *, crop: Image) -> bool:
-        """Whether the still is closer to the source: colour and luma, over the crop and over each box."""
-        return self.gain_db(still, crop=crop) > 0
-
 
 @dataclass(frozen=True, slots=True)
 class Still:

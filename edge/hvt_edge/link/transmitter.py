@@ -188,7 +188,7 @@ class Transmitter:
         """
         with self._lock:
             line_bytes = self.budget.still_allowance(now_ns)
-        if paced and self.pacer is not None and not self.pacer.admits_still(now_ns):
+        if paced and not self.link_is_free(now_ns):
             return 0
         return self._usual_payload(line_bytes) if still is None else self._payload(line_bytes, still, now_ns)
 
@@ -199,17 +199,16 @@ class Transmitter:
         return self._payload(line_bytes, still, now_ns)
 
     def link_is_free(self, now_ns: int) -> bool:
-        """Whether the link is free for a still."""
         return self.pacer is None or self.pacer.admits_still(now_ns)
 
     def want_requested(self, size_bytes: int | None, *, now_ns: int) -> None:
         """A requested still of ``size_bytes`` payload waits for its room; None: none waits any more."""
         with self._lock:
-            if size_bytes is None:
-                self.budget.want_requested(None, now_ns=now_ns)
-                return
-            line_bytes = size_bytes + self._around(Channel.ROI, size_bytes, STILL_ATTACHMENT_BYTES)
-            self.budget.want_requested(min(line_bytes, self.budget.most_requested_bytes), now_ns=now_ns)
+            line_bytes = size_bytes
+            if size_bytes is not None:
+                line_bytes = size_bytes + self._around(Channel.ROI, size_bytes, STILL_ATTACHMENT_BYTES)
+                line_bytes = min(line_bytes, self.budget.most_requested_bytes)
+            self.budget.want_requested(line_bytes, now_ns=now_ns)
 
     def most_requested_bytes(self) -> int:
         """Approximate payload of the largest still that a ground can be sent on request at the present rates."""
@@ -276,7 +275,7 @@ class Transmitter:
             if self.budget.yielding(now_ns):
                 return 0
             line_bytes = self.budget.backlog_allowance(now_ns, reserve=reserve)
-        if self.pacer is not None and not self.pacer.admits_still(now_ns):
+        if not self.link_is_free(now_ns):
             return 0
         around = self._around(Channel.BACKLOG, line_bytes, BACKLOG_ATTACHMENT_BYTES)
         most = min(_MOST_CHUNK_BYTES, max(LEAST_CHUNK_BYTES, round(_CHUNK_S * self.budget.total_bps / 8)))

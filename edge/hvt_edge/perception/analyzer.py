@@ -91,9 +91,7 @@ class Analyzer:
         self._coded_gap = 1
         self._track_ids = SequenceWindow()
         self.spent_ns = 0
-        """Time to decode, detect and track so far."""
         self.frames = 0
-        """Number of frames analyzed."""
 
     @property
     def detect_every(self) -> int:

@@ -95,7 +95,6 @@ class AutoControl:
         self._settings = settings
         self._lock = threading.Lock()
         self.measured = Measured()
-        """The newest measurement of the shadow ground."""
         self.unlike = False
         """The detector does not know the view: any gain in its detections is a gain in guesses."""
         self._changed: deque[bool] = deque(maxlen=settings.most_answers)
@@ -126,19 +125,21 @@ class AutoControl:
     def decide(self, now_ns: int) -> AutoDecisions:
         """Decide by the present measurements; ``now_ns`` is the time of the budget's windows."""
         with self._lock:
-            return self._decide(now_ns)
-
-    def _decide(self, now_ns: int) -> AutoDecisions:
-        before = self._operating.now.decisions
-        tracks = self._tracks(before.tracks) and not self._too_slow
-        # Tracks carry classes too; without tracks only a still can correct a class.
-        named = tracks or self.measured.misnamed_share < self._settings.least_changed
-        wanted = self._settings.finer or self._stills(now_ns) or not named
-        stills = wanted and not self._too_slow
-        decisions = AutoDecisions(tracks, stills, self._says(tracks=tracks, stills=stills))
-        if decisions != before:
-            self._operating.decide(decisions)
-        return decisions
+            before, settings, total_bps = (
+                self._operating.now.decisions,
+                self._settings,
+                self._operating.now.total_bps,
+            )
+            able = not (self.unlike or self._too_slow)
+            tracks = able and settings.tracks_pay(self.measured, total_bps=total_bps, sent=before.tracks)
+            # Tracks carry classes too; without tracks only a still can correct a class.
+            named = tracks or self.measured.misnamed_share < settings.least_changed
+            wanted = settings.finer or self._stills(now_ns) or not named
+            stills = wanted and not self._too_slow
+            decisions = AutoDecisions(tracks, stills, self._says(tracks=tracks, stills=stills))
+            if decisions != before:
+                self._operating.decide(decisions)
+            return decisions
 
     @property
     def stable(self) -> bool:
@@ -149,11 +150,6 @@ class AutoControl:
         bps = self._operating.now.total_bps
         judged = [self._settings.tracks_pay(one, total_bps=bps, sent=sent) for one in near]
         return self.unlike or judged[0] == judged[1]
-
-    def _tracks(self, sent: bool) -> bool:  # noqa: FBT001 - the state before
-        if self.unlike:
-            return False
-        return self._settings.tracks_pay(self.measured, total_bps=self._operating.now.total_bps, sent=sent)
 
     def _stills(self, now_ns: int) -> bool:
         settings = self._settings

@@ -124,7 +124,6 @@ class CpuBudget:
         self._had_ns: dict[Part, int] = {}
         self._perceived_ns = 0
         self._measured: tuple[int, int] | None = None
-        """Time of the last measurement, and perception's processor time until then."""
         self._lost, self._lost_ns, self._left = 0, 0, 1.0
         self._waits_ns: int | None = None
         """The first frame since the detector last ran, or was last not due."""
@@ -134,7 +133,6 @@ class CpuBudget:
         self.detector_share = 1.0
         """Share of its sides that the detector's input keeps at the detection that was admitted last."""
         self.queued = 0
-        """Frames behind the one in hand."""
         self.keyframe_soon = False
         """The detector waits until a due keyframe is coded: video takes longer for it than for any other frame."""
 

@@ -37,7 +37,6 @@ class RingFrame:
     frame_index: int
     capture_ns: int
     size: tuple[int, int]
-    """(width, height) of the source in pixels."""
     pixels: npt.NDArray[np.uint8]
     """The source's own array, not copied: nobody may write into it. With two dimensions it is I420."""
     tracks: Tracks
@@ -108,7 +107,6 @@ class FrameRing:
             return _nearest(frames, lambda one: frames[-1].capture_ns - one.capture_ns) if frames else None
 
     def capture(self, frame: Frame) -> None:
-        """Hold the camera's newest frame, newer than all before."""
         height, width = frame.source_bgr.shape[:2]
         if self._max_bytes:
             self._captured = RingFrame(
@@ -172,7 +170,6 @@ class FrameRing:
         return before is not None and before.base is not None and near
 
     def reach_s(self) -> float:
-        """The time from its oldest to its newest frame."""
         with self._lock:
             if not self._frames:
                 return 0.0

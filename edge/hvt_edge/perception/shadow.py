@@ -66,18 +66,10 @@ class Detected:
     """A ground's report of its own detector."""
 
     receiver_id: int
-    """The ground's number."""
     frame_index: int
     """The last frame that it has processed."""
     objects: int
     """Number of objects that it showed at its last detection up to that frame."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Comparison:
-    frame_index: int
-    capture_ns: int
-    objects: float
 
 
 class GroundDifference:
@@ -92,7 +84,8 @@ class GroundDifference:
 
     def forget(self) -> None:
         """The scene has changed: reports of the one before say nothing of it."""
-        self._open: deque[_Comparison] = deque(maxlen=_MOST_OPEN)
+        self._open: deque[tuple[int, int, float]] = deque(maxlen=_MOST_OPEN)
+        """(frame, capture time, number of objects here) of comparisons that no report has covered."""
         self._mean, self._worth = 0.0, 0.0
         self._worth_ns: int | None = None
         self._first_ns: int | None = None
@@ -105,7 +98,7 @@ class GroundDifference:
     def expect(self, frame_index: int, objects: float, *, capture_ns: int) -> None:
         """Note the number of objects found here on the base picture of this frame."""
         self._fade(capture_ns)
-        self._open.append(_Comparison(frame_index, capture_ns, objects))
+        self._open.append((frame_index, capture_ns, objects))
 
     def take(self, report: Detected) -> None:
         """Compare a report with the number found here on the newest frame that it covers."""
@@ -113,16 +106,16 @@ class GroundDifference:
             self._receiver_id = report.receiver_id
             self._mean, self._worth, self._first_ns = 0.0, 0.0, None
         covered = None
-        while self._open and self._open[0].frame_index <= report.frame_index:
+        while self._open and self._open[0][0] <= report.frame_index:
             covered = self._open.popleft()
         if covered is None:
             return
-        if self._first_ns is None:
-            self._first_ns = covered.capture_ns
-        if covered.capture_ns - self._first_ns < _REST_NS:
+        _, capture_ns, objects = covered
+        self._first_ns = capture_ns if self._first_ns is None else self._first_ns
+        if capture_ns - self._first_ns < _REST_NS:
             return  # the first picture of a ground or a scene is coarser than others
         self._worth += 1
-        self._mean += (report.objects - covered.objects - self._mean) / self._worth
+        self._mean += (report.objects - objects - self._mean) / self._worth
 
     def _fade(self, now_ns: int) -> None:
         if self._worth_ns is not None:
@@ -145,7 +138,6 @@ class Shadow:
     """Source boxes that the base does not show and the ground would list."""
     hidden_p: float = 0.0
     misnamed: float = 0.0
-    """Shown objects that have another class on the base."""
     misnamed_p: float = 0.0
     false: float = 0.0
     """Boxes of the base where the source has none."""
@@ -255,7 +247,6 @@ class ShadowGround:
         self._shown_ids = np.empty(0, np.int64)
         """Tracks that the base showed at the comparison before."""
         self._compared_ids = self._shown_ids
-        """All tracks at that comparison."""
         self.stable = False
         """The caller says that another comparison soon would change no decision."""
         self.scene_began = -1

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, asdict, dataclass, fields
+from dataclasses import KW_ONLY, asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ from hvt_common.runtime.process import notify_systemd
 from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
@@ -47,7 +48,6 @@ class SystemReading:
     """The machine's temperature and the quality of its wireless link; None where the system gives none."""
 
     temperature_c: float | None = None
-    """The temperature of the hottest zone."""
     wireless_quality: float | None = None
     """The driver's count, of 70 with most drivers."""
     wireless_dbm: float | None = None
@@ -95,7 +95,6 @@ class OperatingState:
     allowed_bps: int
     """The rate that may be sent now: less than the budget if the link carries less."""
     base_budget_bps: int
-    """The base stream's share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +102,6 @@ class Frames:
     """Frame counts since the start."""
 
     account: FrameAccount
-    """The outcome of each frame."""
     encoded: int
     unanalyzed: int
     """Skipped by perception for want of time."""
@@ -114,7 +112,6 @@ class LinkState:
     """The edge's view of its link."""
 
     ground: bool
-    """Whether a ground listens."""
     since_ns: int
     """Unix time of the last change of ``ground``."""
     watched: bool
@@ -122,7 +119,6 @@ class LinkState:
     trouble: str | None
     """The reason why no ground can be reached, where that is known."""
     reported_s: float | None
-    """Time since the last report of a ground."""
     round_trip_ms: float | None
     rate_bps: int | None
     """The measured rate of the link; None if it is not measured."""
@@ -130,27 +126,17 @@ class LinkState:
     """Messages from grounds that were damaged, foreign, or of another version."""
 
 
-@dataclass(frozen=True, slots=True)
-class BacklogState:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BacklogState(StoreNumbers):
     """Objects stored while the link is down, and sent afterwards."""
 
     offline: bool
     """Frames and stills go into the store now."""
-    stills: int
-    """Number in the store, like the two below."""
-    segments: int
-    video_s: float
-    disk_bytes: int
     limit_bytes: int
     disk_free_bytes: int | None
     """Free bytes of the store's disk; None where it does not answer."""
     frames_stored: int
     """Frames stored by this session."""
-    sent_stills: int
-    sent_video_s: float
-    evicted_stills: int
-    """Deleted for want of space, like the next."""
-    evicted_segments: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +150,6 @@ class EdgeState:
     """Version of the messages on the wire."""
     edge: str
     session: str
-    """The session's id, hexadecimal."""
     state: Phase
     lockstep: bool
     duration_s: float
@@ -191,7 +176,6 @@ class EdgeState:
     stills_in_flight: int
     """Sent, and in no report yet."""
     stills_not_sent: Mapping[str, int]
-    """Number of candidates without a still, by reason."""
     tracks: int
     encode_ms: float | None
     """Mean of one frame, since the start; like the next."""
@@ -208,7 +192,6 @@ class EdgeState:
     system: SystemReading
     link: LinkState
     backlog: BacklogState | None
-    """None where nothing is stored."""
     failed: tuple[FailedPart, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -334,11 +317,7 @@ class Heartbeat:
             backlog_bps=self._bps(Account.BACKLOG),
             meta_bps=self._bps(Account.META),
             budget_share=None if total_bps is None else total_bps / now.total_bps,
-            frames=Frames(
-                account=self.frames,
-                encoded=counts.encoded,
-                unanalyzed=counts.unanalyzed,
-            ),
+            frames=Frames(self.frames, encoded=counts.encoded, unanalyzed=counts.unanalyzed),
             source_silent_s=silent_s,
             keyframes=self.stills.keyframes.sent,
             keyframe_requests=self.stills.keyframes.served,
@@ -388,12 +367,10 @@ class Heartbeat:
 
 
 def _backlog(backlog: BacklogStage) -> BacklogState:
-    here = {one.name for one in fields(BacklogState)}
-    numbers = asdict(backlog.worker.numbers)
     return BacklogState(
+        **asdict(backlog.worker.numbers),
         offline=backlog.offline,
         limit_bytes=backlog.max_bytes,
         disk_free_bytes=backlog.worker.disk_free_bytes,
         frames_stored=backlog.frames,
-        **{name: number for name, number in numbers.items() if name in here},
     )

@@ -47,7 +47,6 @@ class InfoReporter:
     class_names: tuple[str, ...]
     channels: tuple[Channel, ...]
     still_codecs: Callable[[], tuple[str, ...]]
-    """The codecs of the stills that are sent now."""
     clock: Callable[[], int]
 
     def info(self, received_ns: int | None = None) -> bytes:

@@ -12,24 +12,27 @@ the same quality.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
+import cv2
+import numpy as np
+
 from hvt_common.protocol.messages import AlsoShown
 from hvt_common.values import Frame, Image, View
-from hvt_common.video.base_crop import MAX_SIDE_PX, coded_size
+from hvt_common.video.base_crop import coded_size
 from hvt_common.video.hevc import Picture
 from hvt_common.video.still_codecs import (
     CodedCrop,
     JpegCodec,
-    Parameters,
     StillCodec,
     best_fitting,
     psnr_y_db,
     smallest_reaching,
 )
-from hvt_edge.link.stills import Still
+from hvt_edge.link.stills import Still, size_parameters
 from hvt_edge.perception.candidates import PADDING
 from hvt_edge.stills.policy.base import Request, union_crop
 
@@ -40,6 +43,11 @@ _TRIES = 3
 """Tries to fit payload and parameters into one allowance: parameters hardly change in size."""
 _QUALITY_STEP_PCT = 5
 _LEAST_PCT, _MOST_PCT = 1, 95
+_FLOOR_PCT = 35
+"""Lowest quality: a worse still tells a classifier little. A codec that builds on the base has no floor, because the
+base stays."""
+_CEILING_PCT = 90
+"""Highest quality that may be spent on being better than the base."""
 _READ_BY_ALL = JpegCodec()
 
 
@@ -53,12 +61,97 @@ class NoStill:
 
 
 @dataclass(frozen=True, slots=True)
-class _Fitted:
-    data: bytes
-    parameters: Parameters
+class Coding:
+    """A crop coded at one quality."""
+
+    coded: CodedCrop
     quality_pct: int
-    shown_bgr: Image
-    """The picture that the ground will decode."""
+    size: tuple[int, int]
+
+    @property
+    def size_bytes(self) -> int:
+        return len(self.coded.data)
+
+
+@dataclass(eq=False)
+class Codings:
+    """Codings of one crop by one codec, each made once."""
+
+    job: Still
+    codec: StillCodec
+    pixels: Image | None = None
+    """The crop made smaller; None at its own size."""
+    done: dict[int, CodedCrop] = field(default_factory=dict)
+    _shown: dict[int, Image] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.job = self.job.of_codec(self.codec)
+        self._pixels = self.job.crop_bgr if self.pixels is None else self.pixels
+        self._size = self._pixels.shape[1], self._pixels.shape[0]
+        self._base = self.job.base_crop_bgr if self.codec.needs_base else None
+
+    def at(self, quality_pct: int) -> Coding:
+        if quality_pct not in self.done:
+            self.done[quality_pct] = self.codec.encode(
+                self._pixels, quality_pct=quality_pct, base_bgr=self._base
+            )
+        return Coding(self.done[quality_pct], quality_pct, self._size)
+
+    def shown_bgr(self, one: Coding) -> Image:
+        """The picture that the ground will decode, at the crop's own size."""
+        if one.quality_pct not in self._shown:
+            shown = self.codec.decode(
+                one.coded.data, size=one.size, parameters=one.coded.parameters, base_bgr=self._base
+            )
+            if self.pixels is not None:
+                whole = self.job.crop_bgr.shape[1], self.job.crop_bgr.shape[0]
+                shown = np.asarray(cv2.resize(shown, whole, interpolation=cv2.INTER_CUBIC), np.uint8)
+            self._shown[one.quality_pct] = shown
+        return self._shown[one.quality_pct]
+
+    def gain_db(self, one: Coding) -> float:
+        """The still's gain over the base in closeness to the source; infinite where the base is not known."""
+        if self.job.alternative is None:
+            return math.inf
+        return self.job.alternative.gain_db(self.shown_bgr(one), crop=self.job.crop_bgr)
+
+    def fitting(
+        self, limit_bytes: int, *, low_pct: int, high_pct: int, enough: float = math.inf
+    ) -> Coding | None:
+        """The best quality that fits, or nearly the best; see `best_fitting`."""
+        found = best_fitting(
+            self.codec,
+            self._pixels,
+            limit_bytes=limit_bytes,
+            low_pct=low_pct,
+            high_pct=high_pct,
+            base_bgr=self._base,
+            tried=self.done,
+            enough=enough,
+        )
+        return None if found is None else self.at(found[1])
+
+    def reaching(self, psnr_db: float) -> Coding | None:
+        """The least quality of that luma PSNR."""
+        found = smallest_reaching(
+            self.codec,
+            self._pixels,
+            target_db=psnr_db,
+            low_pct=_LEAST_PCT,
+            high_pct=_MOST_PCT,
+            base_bgr=self._base,
+        )
+        if found is None:
+            return None
+        coded, quality_pct, shown_bgr, _ = found
+        self.done[quality_pct], self._shown[quality_pct] = coded, shown_bgr
+        return self.at(quality_pct)
+
+    def still(self, one: Coding) -> Still:
+        size = size_parameters(self.job.header.crop_source_px, one.size)
+        return self.job.coded(
+            one.coded.data, quality_pct=one.quality_pct, parameters={**size, **one.coded.parameters}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +165,6 @@ class StillMaker:
     """Requested quality; lower where the allowance is smaller, higher where the base is already better."""
     fidelity_db: float = 0.0
     """Luma PSNR to reach with the fewest bytes, in place of ``quality_pct``; 0: the quality is fixed."""
-    floor_pct: int = 35
-    """Lowest quality: a worse still tells a classifier little. A codec that builds on the base has no
-    floor, because the base stays."""
-    ceiling_pct: int = 90
-    """Highest quality that may be spent on being better than the base."""
     min_gain_db: float = 0.1
     """Least gain over the base; it covers the rounding errors of other decoders."""
     least_bytes: int = 0
@@ -84,7 +172,6 @@ class StillMaker:
     readable: Callable[[str], bool] = lambda _codec: True
     """Whether every ground that listens decodes this codec; ``jpeg`` takes the place of any other."""
     padding: float = PADDING
-    max_side_px: int = MAX_SIDE_PX
 
     def __post_init__(self) -> None:
         assert self.fallback is not None or not self.codec.needs_base, f"{self.codec.name} needs a fallback"
@@ -118,7 +205,7 @@ class StillMaker:
         lead = request.candidate
         assert frame.index == lead.frame_index, "a still shows the frame that its box belongs to"
         crop_px = union_crop(request, padding=self.padding, source_size=view.source_size)
-        size = coded_size(crop_px, max_side_px=self.max_side_px)
+        size = coded_size(crop_px)
         if base is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
             return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
         job = Still.cropped(
@@ -146,111 +233,55 @@ class StillMaker:
 
     def code(self, job: Still, *, sequence: int, allowance: Allowance) -> Still | NoStill:
         """Code a crop within ``allowance``, which is called with the still as it comes out."""
-        job, codec = job.with_header(sequence=sequence), self.preferred
-        builds = job.base_crop_bgr is not None and codec.needs_base
-        made = self._fitted(codec if builds else self.without_base, job, allowance)
-        if builds and job.base_far_off:
-            if not isinstance(made, NoStill):
-                return self._cheaper(*made, job) or made[0]
-            made = self._fitted(self.without_base, job, allowance)
-        return made if isinstance(made, NoStill) else made[0]
+        job = job.with_header(sequence=sequence)
+        plain = Codings(job, self.without_base)
+        if job.base_crop_bgr is None or not self.preferred.needs_base:
+            return self._fitted(plain, allowance)
+        building = Codings(job, self.preferred)
+        built = self._fitted(building, allowance)
+        if not job.base_far_off:
+            return built
+        if isinstance(built, NoStill):
+            return self._fitted(plain, allowance)
+        # The fallback's still, if it has the quality of the one built on the base in fewer bytes.
+        shown = building.shown_bgr(building.at(built.header.quality_pct))
+        smaller = plain.reaching(psnr_y_db(shown, job.crop_bgr))
+        if smaller is None or not self.least_bytes <= smaller.size_bytes < len(built.data):
+            return built
+        return plain.still(smaller) if plain.gain_db(smaller) > 0 else built
 
-    def _fitted(self, codec: StillCodec, job: Still, allowance: Allowance) -> tuple[Still, _Fitted] | NoStill:
-        job = job.of_codec(codec)
-        limit_bytes = allowance(job)
+    def _fitted(self, codings: Codings, allowance: Allowance) -> Still | NoStill:
+        limit_bytes = allowance(codings.job)
         for _ in range(_TRIES):
-            fitted = self._best(codec, job, limit_bytes)
-            if isinstance(fitted, NoStill):
-                return fitted
-            still = _filled(job, fitted)
+            best = self._best(codings, limit_bytes)
+            if isinstance(best, NoStill):
+                return best
+            still = codings.still(best)
             excess_bytes = len(still.data) - allowance(still)  # the codec's parameters have taken their part
             if excess_bytes <= 0:
-                return still, fitted
+                return still
             limit_bytes = min(limit_bytes, len(still.data)) - excess_bytes
         return NoStill("too_large")
 
-    def _cheaper(self, built: Still, fitted: _Fitted, job: Still) -> Still | None:
-        # The fallback's still, if it has the quality of the still built on the base in fewer bytes.
-        codec = self.without_base
-        smaller = _reaching(codec, job, psnr_y_db(fitted.shown_bgr, job.crop_bgr))
-        if smaller is None or len(smaller.data) >= len(built.data) or not _beats_base(smaller, job):
-            return None
-        if len(smaller.data) < self.least_bytes:
-            return None
-        return _filled(job.of_codec(codec), smaller)
-
-    def _best(self, codec: StillCodec, job: Still, limit_bytes: int) -> _Fitted | NoStill:
+    def _best(self, codings: Codings, limit_bytes: int) -> Coding | NoStill:
         # The requested fidelity or quality, or the best below that fits; then upwards until the base is beaten.
         if limit_bytes < self.least_bytes:
             return NoStill("too_large")
-        fitted = _reaching(codec, job, self.fidelity_db) if self.fidelity_db else None
-        if fitted is None:
-            fitted = _at(codec, job, _MOST_PCT if self.fidelity_db else self.quality_pct)
-        if len(fitted.data) > limit_bytes:
-            lower = self._best_fitting(codec, job, limit_bytes, below_pct=fitted.quality_pct)
-            helps = lower is not None and len(lower.data) >= self.least_bytes and _beats_base(lower, job)
-            return lower if lower is not None and helps else NoStill("too_large")
-        quality_pct, ceiling_pct = fitted.quality_pct, max(self.ceiling_pct, fitted.quality_pct)
-        if self.least_bytes:
-            ceiling_pct = _MOST_PCT
-        while not _beats_base(fitted, job) or len(fitted.data) < self.least_bytes:
+        one = codings.reaching(self.fidelity_db) if self.fidelity_db else None
+        one = one or codings.at(_MOST_PCT if self.fidelity_db else self.quality_pct)
+        if one.size_bytes > limit_bytes:
+            least_pct = _LEAST_PCT if codings.codec.needs_base else _FLOOR_PCT
+            lower = codings.fitting(limit_bytes, low_pct=least_pct, high_pct=one.quality_pct - 1)
+            if lower is None or lower.size_bytes < self.least_bytes or codings.gain_db(lower) <= 0:
+                return NoStill("too_large")
+            return lower
+        ceiling_pct = _MOST_PCT if self.least_bytes else max(_CEILING_PCT, one.quality_pct)
+        quality_pct = one.quality_pct
+        while codings.gain_db(one) <= 0 or one.size_bytes < self.least_bytes:
             quality_pct += _QUALITY_STEP_PCT
             if quality_pct > ceiling_pct:
                 return NoStill("base_good")
-            fitted = _at(codec, job, quality_pct)
-            if len(fitted.data) > limit_bytes:
+            one = codings.at(quality_pct)
+            if one.size_bytes > limit_bytes:
                 return NoStill("too_large")
-        return fitted
-
-    def _best_fitting(
-        self, codec: StillCodec, job: Still, limit_bytes: int, *, below_pct: int
-    ) -> _Fitted | None:
-        found = best_fitting(
-            codec,
-            job.crop_bgr,
-            limit_bytes=limit_bytes,
-            low_pct=_LEAST_PCT if codec.needs_base else self.floor_pct,
-            high_pct=below_pct - 1,
-            base_bgr=_base(codec, job),
-        )
-        return None if found is None else _decoded(codec, job, *found)
-
-
-def _reaching(codec: StillCodec, job: Still, psnr_db: float) -> _Fitted | None:
-    found = smallest_reaching(
-        codec,
-        job.crop_bgr,
-        target_db=psnr_db,
-        low_pct=_LEAST_PCT,
-        high_pct=_MOST_PCT,
-        base_bgr=_base(codec, job),
-    )
-    if found is None:
-        return None
-    coded, quality_pct, shown_bgr, _ = found
-    return _Fitted(coded.data, coded.parameters, quality_pct, shown_bgr)
-
-
-def _at(codec: StillCodec, job: Still, quality_pct: int) -> _Fitted:
-    coded = codec.encode(job.crop_bgr, quality_pct=quality_pct, base_bgr=_base(codec, job))
-    return _decoded(codec, job, coded, quality_pct)
-
-
-def _decoded(codec: StillCodec, job: Still, coded: CodedCrop, quality_pct: int) -> _Fitted:
-    height, width = job.crop_bgr.shape[:2]
-    shown = codec.decode(
-        coded.data, size=(width, height), parameters=coded.parameters, base_bgr=_base(codec, job)
-    )
-    return _Fitted(coded.data, coded.parameters, quality_pct, shown)
-
-
-def _base(codec: StillCodec, job: Still) -> Image | None:
-    return job.base_crop_bgr if codec.needs_base else None
-
-
-def _beats_base(fitted: _Fitted, job: Still) -> bool:
-    return job.alternative is None or job.alternative.loses_to(fitted.shown_bgr, crop=job.crop_bgr)
-
-
-def _filled(job: Still, fitted: _Fitted) -> Still:
-    return job.coded(fitted.data, quality_pct=fitted.quality_pct, parameters=fitted.parameters)
+        return one

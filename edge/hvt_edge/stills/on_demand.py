@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -41,12 +41,10 @@ class OnDemandRequest:
     """A track or a box, or neither for the whole frame; at a frame or ``ago_ms``, or neither for the newest."""
 
     track_id: int | None = None
-    """The edge's track id."""
     box_xywh_px: tuple[int, int, int, int] | None = None
     """Left, top, width and height in source pixels."""
     frame_index: int | None = None
     ago_ms: int | None = None
-    """Time before the newest frame."""
     quality_pct: int | None = None
     """None for the quality of all stills."""
 
@@ -147,7 +145,6 @@ def box_of(boxes: Boxes, row: int) -> Box:
 
 
 REQUEST_PARAMETER = "ask"
-"""The parameter that carries the request's number."""
 
 _PROMPT_SHARE = 0.6
 """Share of the video's rate for an on-demand still: on a link as thin as the budget it takes about a second."""
@@ -205,10 +202,7 @@ class OnDemand:
     """Whether stills are stored instead of sent."""
 
     def __post_init__(self) -> None:
-        self._maker = replace(
-            self.maker, fidelity_db=0.0
-        )  # crops of frames without a base: never a codec that builds on it
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._outcomes: Newest[int, tuple[str, str]] = Newest(_OUTCOMES)
         """Number → (reason of giving up, note for the requester), both empty at first; of the newest requests."""
         self._next_number = 0
@@ -216,7 +210,6 @@ class OnDemand:
         self._tracks_requested_ns: int | None = None
         """Capture time of the newest frame at the last request for tracks."""
         self._tracked = True
-        """Whether objects were tracked in the newest frame."""
         self._ended = False
 
     def add(self, analyzed: AnalyzedFrame) -> None:
@@ -243,19 +236,18 @@ class OnDemand:
         self._check_queue()
         if request.track_id is not None:
             self._want_tracks(frame.capture_ns)
-        job = crop_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
+        job = crop_for(request, frame, maker=self.maker, view=self.view, class_names=self.class_names)
         with self._lock:
             self._check_queue()
             number = self._next_number
-            parameters = {**job.header.parameters, REQUEST_PARAMETER: number}
-            job = job.with_header(parameters=parameters)
+            job = job.with_header(parameters={**job.header.parameters, REQUEST_PARAMETER: number})
             pending = OnDemandStill(
                 *(job, None, float("inf"), None),
                 number=number,
                 base=frame.base,
+                behind=self.outbox.on_demand is not None,
                 on_demand=request,
             )
-            pending.behind = self.outbox.on_demand is not None
             self.outbox.offer_on_demand(pending)
             self._last = pending
             self._next_number += 1
@@ -297,7 +289,6 @@ class OnDemand:
         return newest.frame_index, tuple(listed), len(tracks)
 
     def wants_tracks(self, capture_ns: int) -> bool:
-        """Whether a ground has requested tracks shortly before this frame."""
         requested_ns = self._tracks_requested_ns
         return requested_ns is not None and capture_ns - requested_ns < _TRACKED_NS
 
@@ -309,12 +300,12 @@ class OnDemand:
         ``paced``: it goes to the link, which has to be free.
         """
         most_bytes = self.line.most_requested_bytes()
-        due = (
+        if (
             pending.ready is None or len(pending.ready.data) > most_bytes
-        )  # the rate may have fallen meanwhile
-        if due and not self._code_anew(pending, most_bytes, now_ns=now_ns):
-            return None
-        assert pending.ready is not None, "it was coded just now"
+        ):  # the rate may have fallen meanwhile
+            if not self._code_anew(pending, most_bytes, now_ns=now_ns):
+                return None
+            assert pending.ready is not None, "it was coded just now"
         still = pending.ready = pending.ready.with_header(sequence=sequence)
         fits = len(still.data) <= self.line.requested_allowance_bytes(now_ns, still=still)
         pending.link_busy = fits and paced and not self.line.link_is_free(now_ns)
@@ -325,7 +316,7 @@ class OnDemand:
 
     def _code_anew(self, pending: OnDemandStill, most_bytes: int, *, now_ns: int) -> bool:
         # Code it for the present limits; False where no still results, and its requester is given the reason.
-        codec, job = self._maker.without_base, pending.crop
+        codec, job = self.maker.without_base, pending.crop
         height, width = job.crop_bgr.shape[:2]
         expected = CostModel.of_codec(codec.name).estimate().of_px(width * height)
         # Coding takes a moment, in which the window gets free.
@@ -346,15 +337,13 @@ class OnDemand:
             refused = error if isinstance(error, RefusedError) else failed
             self._give_up(pending, str(refused), now_ns=now_ns)
             return False
-        with self._lock:
-            self._note(pending.number, note=note)
+        self._note(pending.number, note=note)
         return True
 
     def _give_up(self, pending: OnDemandStill, reason: str, *, now_ns: int) -> None:
         self.line.want_requested(None, now_ns=now_ns)
         self.outbox.give_up(pending)
-        with self._lock:
-            self._note(pending.number, refusal=reason)
+        self._note(pending.number, refusal=reason)
 
     def expired(self, pending: OnDemandStill, reason: str, *, now_ns: int) -> None:
         """It was given up: ``stale`` or ``ended``."""
@@ -367,8 +356,7 @@ class OnDemand:
             why = "those that were requested before it had not gone"
         elif pending.ready is None:  # it was never its turn
             why = "the keyframe that goes before it had no room"
-        with self._lock:
-            self._note(pending.number, refusal=_ENDED if reason == "ended" else f"in {waited_s:g} s {why}")
+        self._note(pending.number, refusal=_ENDED if reason == "ended" else f"in {waited_s:g} s {why}")
 
     def close(self) -> None:
         self._ended = True
@@ -387,4 +375,5 @@ class OnDemand:
             raise RefusedError(f"{pending} requested stills are pending already: try again later")
 
     def _note(self, number: int, *, refusal: str = "", note: str = "") -> None:
-        self._outcomes[number] = refusal, note
+        with self._lock:
+            self._outcomes[number] = refusal, note

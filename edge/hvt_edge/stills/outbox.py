@@ -54,7 +54,6 @@ class OutboxStill:
     job: Still | None
     """The crop to be coded; for a sent still the crop to be coded again, None where that is impossible."""
     request: Request | None
-    """The method's request; None if a ground requested it."""
     utility: float
     """The method's score; infinite if a ground requested it."""
     since_ns: int | None
@@ -118,7 +117,6 @@ class Outbox:
         self.turn = threading.RLock()
         """Held from a still's numbering until it is sent: two threads send, and numbers must rise."""
         self._pending: dict[int, OutboxStill] = {}
-        """The stills by their leading track."""
         self._on_demand: deque[OutboxStill] = deque()
         self._sent: dict[int, OutboxStill] = {}
         """The stills by sequence, in the order of sending: not acknowledged, or with a crop to be coded again."""
@@ -131,7 +129,6 @@ class Outbox:
     # Pending
 
     def __len__(self) -> int:
-        """Pending stills of the method."""
         return len(self._pending)
 
     def __contains__(self, track_id: int) -> bool:
@@ -194,13 +191,11 @@ class Outbox:
             return max(self._pending.values(), key=_order, default=None)
 
     def expire(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
-        """Expire stills of the method that have been pending for too long."""
         with self._lock:
             old = [one for one in self.pending if now_ns - _since_ns(one) > self.settings.max_pending_ns]
             return [self._expire(one, "stale") for one in old]
 
     def expire_on_demand(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
-        """Expire requested stills that have been pending for too long."""
         with self._lock:
             for one in self._on_demand:
                 one.since_ns = now_ns if one.since_ns is None else one.since_ns
@@ -249,18 +244,15 @@ class Outbox:
             one.state, one.coded, one.job = StillState.STORED, still, None
 
     def sent_again(self, sent: OutboxStill) -> None:
-        """Note that a second copy of it is sent."""
         sent.copies += 1
 
     @property
     def unacknowledged(self) -> int:
-        """Number of sent stills that no report has named."""
         with self._lock:
             return len(self._unnamed())
 
     @property
     def sent_bytes(self) -> int:
-        """The bytes of coded stills that are not acknowledged."""
         return sum(len(one.still.data) for one in self._unnamed())
 
     @property

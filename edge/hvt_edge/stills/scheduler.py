@@ -47,21 +47,8 @@ class Suppression:
             return cls(cooldown_s=0.0, min_gain=1.0, avoid_border=False)
         return cls(cooldown_s=cooldown_s, min_gain=min_gain, gain_s=5 * cooldown_s)
 
-    def apply(
-        self, candidates: Sequence[Candidate], *, now_ns: int
-    ) -> tuple[list[Candidate], list[tuple[Candidate, str]]]:
-        """Split into allowed and held candidates; each held one with ``refused cooldown border no_gain``."""
-        allowed: list[Candidate] = []
-        held: list[tuple[Candidate, str]] = []
-        for candidate in candidates:
-            reason = self._reason(candidate, now_ns)
-            if reason is None:
-                allowed.append(candidate)
-            else:
-                held.append((candidate, reason))
-        return allowed, held
-
-    def _reason(self, candidate: Candidate, now_ns: int) -> str | None:
+    def reason(self, candidate: Candidate, *, now_ns: int) -> str | None:
+        """Why it is held back: ``refused cooldown border no_gain``; None where it is not."""
         if _since_s(candidate.last_refused_ns, now_ns) < self.retry_s:
             return "refused"
         rested_s = _since_s(candidate.last_sent_ns, now_ns)
@@ -207,31 +194,29 @@ class Chooser:
             self._crop(request, analyzed, now_ns=now_ns)
 
     def _unheld(self, candidates: Sequence[Candidate], *, now_ns: int) -> list[Candidate]:
-        allowed, held = self.suppression.apply(candidates, now_ns=now_ns)
-        for _, reason in held:
-            self.on_outcome("deferred", reason)
-        # The gate comes last because it reads pixels, and before the method, so that the places in the outbox go to
-        # candidates that gain from a still.
-        return [one for one in allowed if not self._gated(one, now_ns=now_ns)]
-
-    def _gated(self, candidate: Candidate, *, now_ns: int) -> bool:
-        if not self.gate.on or candidate.loss is None or not self.gate.good_enough(candidate.loss()):
-            return False
-        self._refuse(candidate, "base_good", now_ns=now_ns)
-        return True
+        unheld = []
+        for one in candidates:
+            # The gate comes last because it reads pixels, and before the method, so that the places in the outbox go
+            # to candidates that gain from a still.
+            if (reason := self.suppression.reason(one, now_ns=now_ns)) is not None:
+                self.on_outcome("deferred", reason)
+            elif self.gate.on and one.loss is not None and self.gate.good_enough(one.loss()):
+                self._refuse(one, "base_good", now_ns=now_ns)
+            else:
+                unheld.append(one)
+        return unheld
 
     def _requests(self, candidates: list[Candidate], step: Step) -> list[Request]:
         requests = self.method.requests(candidates, step)
         if not self.share:
             return requests
-        joined = group(
+        return group(
             requests,
             cost=step.cost,
             overhead_bytes=step.still_overhead_bytes,
             padding=self.maker.padding,
             source_size=self.view.source_size,
         )
-        return [request for request, _ in joined]
 
     def _crop(self, request: Request, analyzed: AnalyzedFrame, *, now_ns: int) -> None:
         if not self.outbox.admits(request, now_ns=now_ns):
@@ -337,26 +322,17 @@ class Chooser:
         self._held_up.pop(pending.track_id, None)
         height, width = job.crop_bgr.shape[:2]
         self._cost_of(made.header.codec).observe(area_px=width * height, size_bytes=len(made.data))
-        resend = None
-        if (
-            not pending.again
-        ):  # else its tracks have rested since the first sending, and it is not sent a third time
+        resend, plain = None, self.maker.without_base
+        # A second time its tracks have rested since the first sending, and it is not sent a third time.
+        if not pending.again:
             for one in (pending.request.candidate, *pending.request.also):
                 self.memory.record_sent(one, frame_index=made.header.frame_index, now_ns=now_ns)
-            if (
-                made.header.codec != self.maker.without_base.name
-            ):  # it builds on the base, and a ground may lack that
-                resend = job.without_base(self.maker.without_base)
+            if made.header.codec != plain.name:  # it builds on the base, and a ground may lack that
+                resend = job.without_base(plain)
         self._coded(pending, made, now_ns=now_ns, store=store, resend=resend)
 
     def _coded(
-        self,
-        pending: OutboxStill,
-        still: Still,
-        *,
-        now_ns: int,
-        store: bool,
-        resend: Still | None = None,
+        self, pending: OutboxStill, still: Still, *, now_ns: int, store: bool, resend: Still | None = None
     ) -> None:
         # It is sent under the number that is next now: another may have gone while it was coded.
         if still.header.sequence != (number := self.outbox.sequence(store=store)):

@@ -156,7 +156,6 @@ class StillStage:
                 )
 
     def note_load(self, cores: float, *, now_ns: int) -> None:
-        """Note the cores that the process uses; about once a second."""
         cpu_budget = self.analyzer.cpu_budget
         cpu_budget.measure(cores, now_ns=now_ns)
         if self.auto is not None:
@@ -205,7 +204,6 @@ class StillSender:
 
     def __post_init__(self) -> None:
         self._breaks = 0
-        """Breaks of the link that were noticed here."""
 
     @property
     def offline(self) -> bool:

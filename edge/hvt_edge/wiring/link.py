@@ -9,7 +9,7 @@ from hvt_common.values import View
 from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.rate_control import RateController
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.auto import AutoSettings
 from hvt_edge.source.contract import CameraStream
@@ -102,8 +102,8 @@ def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int,
             metadata_bps=config.metadata_bps,
         )
         floor_bps = max(floor_bps, needs)
-    settings = RateSettings(ceiling_bps=config.budget_bps, floor_bps=min(config.budget_bps, floor_bps))
-    return Pacer(RateController(settings))
+    floor_bps = min(config.budget_bps, floor_bps)
+    return Pacer(RateController(ceiling_bps=config.budget_bps, floor_bps=floor_bps))
 
 
 def make_camera_rates(

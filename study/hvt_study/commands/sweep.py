@@ -21,7 +21,7 @@ from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import Source, open_source
 from hvt_edge.source.video import VideoSource
-from hvt_edge.stills.policy.selectors import SELECTORS, select
+from hvt_edge.stills.policy.selectors import SELECTORS
 from hvt_study.commands.arguments import check_whole, option
 from hvt_study.commands.output import check_out, print_columns, writing
 
@@ -56,7 +56,7 @@ def sweep(frames: Mapping[int, RawDetections], *, frame_area_px: float) -> list[
     rows = []
     for selector in SELECTORS:
         counts = [
-            len(select(selector, found.boxes_xyxy_px, found.confidences, found.class_names, frame_area_px))
+            len(selector.select(found.boxes_xyxy_px, found.confidences, found.class_names, frame_area_px))
             for found in frames.values()
         ]
         selected, covered = sum(counts), sum(1 for count in counts if count)

@@ -1,4 +1,4 @@
-"""A disk of one megabyte."""
+"""A store, and a disk of one megabyte."""
 
 from __future__ import annotations
 
@@ -7,12 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from hvt_edge.backlog.disk import Store
 from programs.small_disk import small_disk
+from rigs.kept import opened
 
 
 @pytest.fixture(name="small_disk")
 def _small_disk(tmp_path) -> Iterator[Path]:
-    """With a file `filler` of 0.4 MB on it."""
     with small_disk(tmp_path / "small") as path:
         (path / "filler").write_bytes(bytes(400_000))
         yield path
+
+
+@pytest.fixture
+def folder(tmp_path) -> Iterator[Store]:
+    with opened(tmp_path) as folder:
+        yield folder

@@ -30,32 +30,30 @@ TESTS = Path(__file__).resolve().parents[3] / "tests" / "support"
 
 
 def numbers(entries) -> list[int]:
-    """Of entries, in their order."""
     return [entry.number for entry in entries]
 
 
 def read_units(folder):
-    """All frames that are kept and can be read, in order of capture."""
     objects = [folder.read(entry) for entry in reversed(list(folder.newest_segments()))]
     return [unit for data in objects if data is not None for unit in parse_backlog_units(data)]
 
 
-# Segments
+def units_of(folder) -> list[bytes]:
+    return [one.data for one in read_units(folder)]
 
 
 def change(path: Path, statement: str) -> None:
-    """To the database, while nobody has it."""
     with contextlib.closing(sqlite3.connect(path / FILE_NAME)) as db, db:
         db.execute(statement)
 
 
-def test_a_segment_gives_back_every_byte(tmp_path):
-    """The hole in the ground's recording would be filled with something else, at other times."""
-    with opened(tmp_path) as folder:
-        add_units(folder, UNITS)
-        assert [(one.frame_index, one.capture_ns, one.keyframe, one.data) for one in read_units(folder)] == [
-            (one.frame_index, one.capture_ns, one.keyframe, one.data) for one in UNITS
-        ]
+@pytest.mark.parametrize("units", [UNITS, UNITS[20:27]], ids=["whole", "without a keyframe"])
+def test_a_segment_gives_back_every_byte(folder, units):
+    """The hole in the ground's recording would be filled with something else, or frames be missing."""
+    add_units(folder, units)
+    assert [(one.frame_index, one.capture_ns, one.keyframe, one.data) for one in read_units(folder)] == [
+        (one.frame_index, one.capture_ns, one.keyframe, one.data) for one in units
+    ]
 
 
 def test_any_player_shows_what_the_manual_takes_out_of_it(tmp_path):
@@ -77,7 +75,7 @@ def test_a_damaged_frame_ends_its_segment_and_costs_no_other(tmp_path):
     change(tmp_path, "UPDATE part SET data = zeroblob(100) WHERE frame_index = 30")
     change(tmp_path, "UPDATE part SET data = 'text' WHERE frame_index = 150")
     with opened(tmp_path) as folder:
-        assert [one.data for one in read_units(folder)] == [one.data for one in UNITS[:30]]
+        assert units_of(folder) == [one.data for one in UNITS[:30]]
         assert (folder.segments, folder.damaged) == (1, 1), "the second has no whole frame at all"
 
 
@@ -101,25 +99,13 @@ def test_a_damaged_file_is_put_aside_and_another_begun(tmp_path, caplog, damage)
         assert len(read_units(folder)) == 60
 
 
-def test_a_run_without_a_keyframe_is_kept_too(tmp_path):
-    """The frames that were on their way when the link broke would be missing."""
-    with opened(tmp_path) as folder:
-        add_units(folder, UNITS[20:27])
-        assert [one.frame_index for one in read_units(folder)] == list(range(20, 27))
-        assert [one.data for one in read_units(folder)] == [one.data for one in UNITS[20:27]]
-
-
-def test_segments_begin_with_keyframes_and_are_bounded(tmp_path):
+def test_segments_begin_with_keyframes_and_are_bounded(folder):
     """Nothing could be evicted or sent but all of it."""
-    with opened(tmp_path) as folder:
-        add_units(folder, UNITS[3:15] + UNITS[15:] + [shifted(unit, 20) for unit in UNITS[:20]])
-        firsts = sorted(numbers(folder.newest_segments()))
-        assert firsts == [3, 15, 300], "a keyframe after less than five seconds stays in its segment"
-        assert folder.span_ns == pytest.approx((11 + 44 + 19) / 15 * S, abs=3)
-        assert len(read_units(folder)) == 57 + 20
-
-
-# The folder
+    add_units(folder, UNITS[3:15] + UNITS[15:] + [shifted(unit, 20) for unit in UNITS[:20]])
+    firsts = sorted(numbers(folder.newest_segments()))
+    assert firsts == [3, 15, 300], "a keyframe after less than five seconds stays in its segment"
+    assert folder.span_ns == pytest.approx((11 + 44 + 19) / 15 * S, abs=3)
+    assert len(read_units(folder)) == 57 + 20
 
 
 def test_nothing_is_made_before_something_is_kept(tmp_path):
@@ -139,7 +125,7 @@ def test_what_was_kept_is_there_after_a_restart(tmp_path):
         before = folder.disk_bytes
     with opened(tmp_path, session_id=8) as folder:
         assert numbers(folder.best_stills()) == [6, 2**31 + 1, 2**31, 5, 4]
-        assert [one.data for one in read_units(folder)] == [one.data for one in UNITS]
+        assert units_of(folder) == [one.data for one in UNITS]
         assert folder.disk_bytes == before
         info = folder.info_of(7)
         assert Info.parse(folder.read(info)) == INFO
@@ -203,14 +189,9 @@ def test_a_clock_that_is_set_drops_nothing(tmp_path, caplog, set_by_s, boot):
         add_stills(folder, {1: 1.0})
         add_units(folder, UNITS)
     for session_id in (8, 9):
-        now_s = set_by_s + 60
-        with opened(
-            tmp_path,
-            session_id=session_id,
-            oldest_ns=max(0, START_NS + (now_s - HOUR_S) * S),
-            at_s=(now_s, 60),
-            boot=boot,
-        ) as folder:
+        oldest_ns = max(0, START_NS + (set_by_s + 60 - HOUR_S) * S)
+        at = {"oldest_ns": oldest_ns, "at_s": (set_by_s + 60, 60), "boot": boot}
+        with opened(tmp_path, session_id=session_id, **at) as folder:
             assert (folder.stills, folder.segments) == (1, 1)
     assert caplog.messages == []
 
@@ -240,8 +221,7 @@ def test_corrupt_entries_are_skipped_with_few_warnings(tmp_path, caplog):
     with opened(tmp_path) as folder, caplog.at_level(logging.WARNING):
         kinds = [folder.read(entry) is not None for entry in list(folder.best_stills())]
         assert sorted(kinds) == [False, False, False, True]
-        assert folder.stills == 1
-        assert folder.damaged == 3
+        assert (folder.stills, folder.damaged) == (1, 3)
     assert len(caplog.records) == 2, "the first, the second, then the fourth …"
 
 
@@ -265,14 +245,13 @@ def test_the_store_is_bounded_and_the_least_useful_goes_first(tmp_path):
         assert on_disk <= 2_000_000, "with its log"
 
 
-def test_a_still_loses_worth_with_age(tmp_path):
+def test_a_still_loses_worth_with_age(folder):
     """An hour-old still of some car would come before the one of a minute ago."""
-    with opened(tmp_path) as folder:
-        add_stills(folder, {1: 4.0})
-        add_stills(folder, {2: 1.0}, capture_ns=START_NS + 600 * S)
-        assert numbers(folder.best_stills()) == [1, 2]
-        add_stills(folder, {3: 1.0}, capture_ns=START_NS + 1300 * S)
-        assert numbers(folder.best_stills()) == [3, 1, 2]
+    add_stills(folder, {1: 4.0})
+    add_stills(folder, {2: 1.0}, capture_ns=START_NS + 600 * S)
+    assert numbers(folder.best_stills()) == [1, 2]
+    add_stills(folder, {3: 1.0}, capture_ns=START_NS + 1300 * S)
+    assert numbers(folder.best_stills()) == [3, 1, 2]
 
 
 def test_two_edges_do_not_share_a_folder(tmp_path):
@@ -328,8 +307,6 @@ def test_the_default_folder_is_where_programs_keep_their_state(monkeypatch, tmp_
     monkeypatch.setenv("XDG_STATE_HOME", "")
     assert default_folder("uav-1") == Path.home() / ".local" / "state" / "hvt" / "uav-1"
 
-
-# Kills and full disks
 
 _WRITER = """
 import sys

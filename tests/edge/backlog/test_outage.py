@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import pytest
 
@@ -14,7 +15,6 @@ S = 1_000_000_000
 
 
 def states(outage: Outage, *, first: float, last: float, linked: bool, reports: float = 0) -> list[bool]:
-    """Asked fifteen times a second; a ground reports each ``reports`` seconds."""
     answers, next_report = [], first
     for index in range(round(first * 15), round(last * 15)):
         now = index / 15
@@ -25,24 +25,30 @@ def states(outage: Outage, *, first: float, last: float, linked: bool, reports: 
     return answers
 
 
-def test_a_clip_that_nobody_has_heard_yet_is_not_kept():
-    """Each run of a clip without a ground would fill the disk."""
-    assert not any(states(Outage(live=False), first=0, last=30, linked=False))
-
-
-def test_a_camera_is_kept_from_its_first_frame():
-    """What a drone saw before the ground was switched on would be lost."""
-    assert all(states(Outage(live=True), first=0, last=5, linked=False))
-
-
-def test_a_ground_that_falls_silent_is_noticed_long_before_zenoh_does():
-    """Seconds of the flight would go into a dead connection."""
-    outage = Outage(live=False)
-    assert not any(states(outage, first=0, last=10, linked=True, reports=0.5))
-    after = states(outage, first=10, last=14, linked=True)
-    assert 1.0 <= after.index(True) / 15 <= 1.6
-    assert all(after[after.index(True) :])
-    assert not any(states(outage, first=14, last=16, linked=True, reports=0.5)), "one report ends it"
+@pytest.mark.parametrize(
+    ("live", "stretches"),
+    [
+        # Each run of a clip without a ground would fill the disk; what a drone saw before its ground would be lost.
+        (False, [(30, False, 0, 0, 0)]),
+        (True, [(5, False, 0, 5, 5)]),
+        # Another program that shows the video, and never reports, would get a frame a second.
+        (True, [(30, True, 0, 0, 0)]),
+        # Seconds of the flight would go into a dead connection; one report ends it.
+        (False, [(10, True, 0.5, 0, 0), (4, True, 0, 2.4, 3), (2, True, 0.5, 0, 0)]),
+        # Keeping would go on with somebody there: the silence of before is not held against who is not heard of yet.
+        (False, [(3, True, 0.5, 0, 0), (17, False, 0, 17, 17), (10, True, 0, 0, 0)]),
+        # After 15 s of silence on a living link it was the ground that went.
+        (False, [(3, True, 0.5, 0, 0), (27, True, 0, 13, 14.5)]),
+    ],
+    ids=["clip", "camera", "listener", "silent", "gone", "left"],
+)
+def test_what_is_an_outage_and_how_long_it_lasts(live, stretches):
+    outage, first = Outage(live=live), 0
+    for lasts_s, linked, reports_s, least_s, most_s in stretches:
+        away = states(outage, first=first, last=first + lasts_s, linked=linked, reports=reports_s)
+        first += lasts_s
+        assert least_s <= sum(away) / 15 <= most_s
+        assert sum(one != other for one, other in pairwise(away)) <= 2, "it is not away by turns"
 
 
 def test_a_link_that_passes_small_messages_alone_is_an_outage():
@@ -105,36 +111,11 @@ def test_a_ground_with_video_that_leaves_is_no_outage_for_a_program_that_stays()
         assert not any(outage.offline(number * S // 2 + late, linked=True) for late in (0, S // 3))
 
 
-def test_a_ground_that_is_gone_is_an_outage_and_its_return_ends_it():
-    """Keeping would go on with somebody there, or not begin."""
-    outage = Outage(live=False)
-    states(outage, first=0, last=3, linked=True, reports=0.5)
-    assert all(states(outage, first=3, last=20, linked=False))
-    # Back, and not heard of yet: the silence of before is not held against it.
-    assert not any(states(outage, first=20, last=30, linked=True))
-
-
-def test_who_listens_and_never_reports_gets_everything():
-    """Another program that shows the video would get a frame a second."""
-    assert not any(states(Outage(live=True), first=0, last=30, linked=True))
-
-
-def test_a_ground_that_left_does_not_keep_the_others_from_seeing():
-    """After 15 s of silence on a living link it was the ground that went."""
-    outage = Outage(live=False)
-    states(outage, first=0, last=3, linked=True, reports=0.5)
-    after = states(outage, first=3, last=30, linked=True)
-    assert after[-1] is False
-    assert 13 <= sum(after) / 15 <= 14.5
-
-
 def unit(index: int, size: int = 1_000) -> AccessUnit:
-    """An access unit."""
     return AccessUnit(index, index * S // 15, bytes(size), keyframe=index == 0)
 
 
 def flown(count: int, *, each_ns: int = S // 10, **bounds: int) -> BaseInFlight:
-    """So many access units sent."""
     in_flight = BaseInFlight(**bounds)
     for index in range(count):
         in_flight.sent(index, unit(index), now_ns=index * each_ns)
@@ -142,7 +123,6 @@ def flown(count: int, *, each_ns: int = S // 10, **bounds: int) -> BaseInFlight:
 
 
 def lost(in_flight: BaseInFlight) -> list[int]:
-    """What an outage takes."""
     return [one.frame_index for one in in_flight.take()]
 
 
@@ -167,17 +147,12 @@ def test_frames_in_flight_are_bounded_in_bytes_and_age():
 def test_frame_loop_and_link_may_act_at_once():
     """The edge would crash in flight, once in a thousand."""
     in_flight = BaseInFlight()
-
-    def run(work) -> None:
-        for index in range(800):
-            work(index)
-
     works = (
         lambda index: in_flight.sent(index, unit(index, 10), now_ns=index),
         lambda index: in_flight.on_report(index - 5),
         lambda index: in_flight.take() if index % 50 == 0 else None,
     )
     with ThreadPoolExecutor(len(works)) as threads:
-        list(threads.map(run, works))
+        list(threads.map(lambda work: [work(index) for index in range(800)], works))
     in_flight.take()
     assert in_flight.size_bytes == 0

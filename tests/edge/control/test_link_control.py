@@ -8,7 +8,7 @@ import pytest
 
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.rate_control import RateController
 from rigs.keeping import Rig
 
 SECOND_NS = 1_000_000_000
@@ -16,7 +16,7 @@ SECOND_NS = 1_000_000_000
 
 def test_who_reports_nothing_is_not_waited_for():
     """A plain Zenoh program would see half a second of video, and then nothing for two."""
-    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    pacer = Pacer(RateController(ceiling_bps=800_000, floor_bps=100_000))
     pacer.link(True, reports=False, now_ns=0)
     for frame in range(60):
         now_ns = frame * SECOND_NS // 15

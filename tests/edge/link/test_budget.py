@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -31,25 +32,29 @@ class Run:
         self.budget = RollingBudget(self.settings)
 
     def base(self, size: int, now_ns: int, *, keyframe: bool = False) -> int:
-        """One base message."""
         at_ns = self.budget.earliest_ns(size, now_ns=now_ns, base=self.own_peak)
         self.budget.record_base(size, now_ns=at_ns, keyframe=keyframe)
         self.events.append((at_ns, size, "base"))
         return at_ns
 
     def status(self, size: int, now_ns: int) -> None:
-        """One report."""
         at_ns = self.budget.earliest_ns(size, now_ns=now_ns)
         self.budget.record_metadata(size, now_ns=at_ns)
         self.events.append((at_ns, size, "meta"))
 
     def still(self, size: int, now_ns: int) -> None:
-        """One still."""
         self.budget.record_still(size, now_ns=now_ns)
         self.events.append((now_ns, size, "still"))
 
+    def stills(self, now_ns: int, rng: np.random.Generator, *, most: int = 4, greed: float = 1.0) -> None:
+        """Some, of whatever size there is room for."""
+        for _ in range(most):
+            room = self.budget.still_allowance(now_ns)
+            if room < 300:
+                break
+            self.still(int(rng.integers(300, max(300, round(room * greed)) + 1)), now_ns)
+
     def fullest(self, window_ns: int, kinds: tuple[str, ...] = ("base", "meta", "still")) -> int:
-        """Most bytes in any window (t - W, t]; the fullest ends with an event."""
         chosen = [(at_ns, size) for at_ns, size, kind in self.events if kind in kinds]
         return max(
             (sum(size for at_ns, size in chosen if end - window_ns < at_ns <= end) for end, _ in chosen),
@@ -57,15 +62,18 @@ class Run:
         )
 
 
+def frame_times(count: float, fps: float = 15) -> Iterator[tuple[int, int]]:
+    """Numbers and times of frames."""
+    return ((number, START_NS + round(number * SECOND_NS / fps)) for number in range(round(count)))
+
+
 def total_bytes(one: BudgetSettings) -> float:
-    """B_tot times the window."""
     return one.total_bps * one.window_ns / 8 / SECOND_NS
 
 
 def budgets(
     *, windows: tuple[float, ...] = (0.5, 1.0, 2.3), borrow_unused: bool | None = None
 ) -> st.SearchStrategy[BudgetSettings]:
-    """Plausible settings."""
     return st.builds(
         lambda total, share, fps, window, metadata, borrow_unused: BudgetSettings(
             total_bps=total,
@@ -90,19 +98,14 @@ def test_no_rolling_window_exceeds_the_total(one, seed, burst, greed):
     """The link would be asked for more than the user has, in some second of the flight."""
     rng = np.random.default_rng(seed)
     run, mean = Run(one), one.base_bps / 8 / one.fps
-    for number in range(min(240, round(6 * one.fps) + 20)):
-        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+    for number, now_ns in frame_times(min(240, round(6 * one.fps) + 20), one.fps):
         keyframe = number == 0 or rng.random() < 0.02
         size = mean * rng.gamma(2, 0.5) * (1 + burst * (rng.random() < 0.1)) + (8 * mean if keyframe else 0)
         size = int(min(size, total_bytes(one)))  # no single message exceeds the window
         run.base(size, now_ns, keyframe=keyframe)
         if number % max(1, round(one.fps)) == 0:
             run.status(400, now_ns)
-        for _ in range(4):
-            room = run.budget.still_allowance(now_ns)
-            if room < 300:
-                break
-            run.still(int(rng.integers(300, max(300, round(room * greed)) + 1)), now_ns)
+        run.stills(now_ns, rng, greed=greed)
     assert run.fullest(one.window_ns) <= total_bytes(one)
 
 
@@ -112,11 +115,9 @@ def test_stills_keep_to_their_share(one, seed):
     """Stills would live on what the base leaves, and the base's quality would be paid for twice."""
     rng = np.random.default_rng(seed)
     run = Run(one)
-    for number in range(min(240, round(8 * one.fps))):
-        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+    for _, now_ns in frame_times(min(240, round(8 * one.fps)), one.fps):
         run.base(int(one.base_bps / 8 / one.fps * rng.uniform(0.1, 0.6)), now_ns)  # it leaves a lot
-        while (room := run.budget.still_allowance(now_ns)) >= 200:
-            run.still(int(rng.integers(200, room + 1)), now_ns)
+        run.stills(now_ns, rng, most=1000)
     share = one.still_bps / 8
     for seconds in (one.window_ns / SECOND_NS, 1.0, 4.0):
         fullest = run.fullest(round(seconds * SECOND_NS), ("still",))
@@ -129,8 +130,7 @@ def test_a_base_message_waits_no_longer_than_a_window_and_keeps_its_order(one, s
     """A picture would come late for nothing, or before the one that it rests on."""
     rng = np.random.default_rng(seed)
     run, last_ns = Run(one, own_peak=False), 0
-    for number in range(100):
-        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+    for _, now_ns in frame_times(100, one.fps):
         size = int(rng.integers(1, round(total_bytes(one) * 1.3)))
         ready_ns = max(now_ns, last_ns)
         before = sum(held for at_ns, held, _ in run.events if at_ns > ready_ns - one.window_ns)
@@ -195,15 +195,10 @@ def test_two_threads_with_times_a_little_apart_hold_it_too(seed, one, skew):
     """The still thread decides at a time that has passed, while a base message already waits for a later one."""
     rng = np.random.default_rng(seed)
     run, mean = Run(one), one.base_bps / 8 / one.fps
-    for number in range(100):
-        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+    for _, now_ns in frame_times(100, one.fps):
         run.base(int(min(mean * rng.gamma(1, 1.5), total_bytes(one))), now_ns)
         late_ns = now_ns - int(rng.integers(0, skew + 1))
-        for _ in range(3):
-            room = run.budget.still_allowance(late_ns)
-            if room < 200:
-                break
-            run.still(int(rng.integers(200, room + 1)), late_ns)
+        run.stills(late_ns, rng, most=3)
     assert run.fullest(one.window_ns) <= total_bytes(one)
 
 
@@ -214,8 +209,7 @@ def test_with_a_steady_base_the_stills_get_their_share(total_bps, base_bps, wind
     one = BudgetSettings(total_bps, base_bps, fps=15, window_ns=round(window_s * SECOND_NS))
     run, sent, seconds = Run(one), 0, 30
     rng = np.random.default_rng(1)
-    for number in range(seconds * 15):
-        now_ns = START_NS + round(number * SECOND_NS / 15)
+    for _, now_ns in frame_times(seconds * 15):
         run.base(round(base_bps / 8 / 15 * rng.uniform(0.9, 1.1)), now_ns)
         while run.budget.still_allowance(now_ns) >= 1_500:
             run.still(1_500, now_ns)
@@ -228,8 +222,7 @@ def test_stills_yield_where_the_base_overshoots():
     """Stills and a burst of the base together would fill the link's queues."""
     one = BudgetSettings(800_000, 650_000, fps=15)
     run, rooms = Run(one), []
-    for number in range(45):
-        now_ns = START_NS + round(number * SECOND_NS / 15)
+    for number, now_ns in frame_times(45):
         run.base(round(650_000 / 8 / 15 * (1.2 if number >= 15 else 1.0)), now_ns)
         rooms.append(run.budget.still_allowance(now_ns))
     assert rooms[14] > 15_000
@@ -240,28 +233,22 @@ def test_a_keyframe_fits_once_what_was_before_it_has_left():
     """It would be sent into a full window, and every picture after it would wait."""
     one = BudgetSettings(800_000, 650_000, fps=15)  # 100 000 bytes a window
     run = Run(one)
-    for number in range(30):
-        now_ns = START_NS + round(number * SECOND_NS / 15)
+    for _, now_ns in frame_times(30):
         run.base(5_400, now_ns)
     now_ns += SECOND_NS // 15
     assert run.budget.keyframe_fits(20_000, now_ns=now_ns)
     run.still(10_000, now_ns)
     assert not run.budget.keyframe_fits(20_000, now_ns=now_ns)
     # The stills leave after a second in which the base went on as before.
-    for number in range(30, 46):
-        now_ns = START_NS + round(number * SECOND_NS / 15)
+    for _, now_ns in list(frame_times(46))[30:]:
         run.base(5_400, now_ns)
     assert run.budget.keyframe_fits(20_000, now_ns=now_ns + SECOND_NS // 15)
-
-
-def test_after_a_hole_the_window_has_room_for_a_keyframe():
-    """A camera that comes back would be shown by difference from a picture that is long gone."""
-    run = Run(BudgetSettings(800_000, 760_000, fps=15))
-    for number in range(30):
-        now_ns = START_NS + round(number * SECOND_NS / 15)
-        run.base(6_300, now_ns)
-    assert not run.budget.keyframe_fits(20_000, now_ns=now_ns)
-    assert run.budget.keyframe_fits(20_000, now_ns=now_ns + 2 * SECOND_NS)
+    # A camera that comes back would be shown by difference from a picture that is long gone.
+    thin = Run(BudgetSettings(800_000, 760_000, fps=15))
+    for _, now_ns in frame_times(30):
+        thin.base(6_300, now_ns)
+    assert not thin.budget.keyframe_fits(20_000, now_ns=now_ns)
+    assert thin.budget.keyframe_fits(20_000, now_ns=now_ns + 2 * SECOND_NS)
 
 
 @pytest.mark.parametrize("window_s", [0.5, 1.0, 4.0])
@@ -334,10 +321,8 @@ class Flight:
 
 
 def fly(one: BudgetSettings, *, every: int, use: float, seconds: int = 20, seed: int = 0) -> Flight:
-    """Stills as large and as many as are admitted, on each index, beside a base that uses a share of B_v."""
     rng, run, longest = np.random.default_rng(seed), Run(one), 0
-    for index in range(seconds * 15):
-        now_ns = START_NS + round(index * SECOND_NS / 15)
+    for index, now_ns in frame_times(seconds * 15):
         if index % every == 0:
             at_ns = run.base(round(use * one.base_bps / 8 / one.fps * rng.uniform(0.8, 1.2)), now_ns)
             longest = max(longest, at_ns - now_ns)
@@ -393,21 +378,16 @@ def test_no_window_exceeds_the_total_when_rate_and_share_change_in_flight(one, s
     rng = np.random.default_rng(seed)
     one = replace(one, fps=15.0)
     run, every, base_bps, since = Run(one), 1, one.base_bps, 0
-    for index in range(45 * (len(changes) + 1)):
-        now_ns = START_NS + round(index * SECOND_NS / 15)
+    for index, now_ns in frame_times(45 * (len(changes) + 1)):
         keyframe = index % 45 == 0
         if keyframe and index:
             share, every = changes[index // 45 - 1]
             base_bps, since = round(one.total_bps * share), index
-            run.budget.set_base(base_bps, 15 / every, now_ns=now_ns)
+            run.budget.set_total(one.total_bps, base_bps, 15 / every, now_ns=now_ns)
         if (index - since) % every == 0:
             size = base_bps / 8 * every / 15 * rng.gamma(4, 0.25) * (3 if keyframe else 1)
             run.base(int(min(size, total_bytes(one))), now_ns, keyframe=keyframe)
-        for _ in range(4):
-            room = run.budget.still_allowance(now_ns)
-            if room < 200:
-                break
-            run.still(int(rng.integers(200, room + 1)), now_ns)
+        run.stills(now_ns, rng)
     assert run.fullest(one.window_ns) <= total_bytes(one)
 
 
@@ -415,10 +395,9 @@ def test_a_new_split_changes_what_stills_get_and_no_frame_waits_for_it():
     """Bits that the scene asks for elsewhere would stay where they were, or pictures would come late."""
     run = Run(BudgetSettings(300_000, 240_000, fps=15))
     sent = {"before": 0, "after": 0}
-    for index in range(15 * 40):
-        now_ns = START_NS + round(index * SECOND_NS / 15)
+    for index, now_ns in frame_times(15 * 40):
         if index == 300:
-            run.budget.set_base(200_000, 5.0, now_ns=now_ns)
+            run.budget.set_total(300_000, 200_000, 5.0, now_ns=now_ns)
         coded = index < 300 or index % 3 == 0
         if coded:
             at_ns = run.base(round((240_000 if index < 300 else 3 * 200_000) / 8 / 15), now_ns)
@@ -435,8 +414,7 @@ def test_metadata_comes_out_of_what_stills_have():
     """The tracks channel would make every picture wait, because stills had already spent its bytes."""
     one = BudgetSettings(200_000, 160_000, fps=15, metadata_bps=10_000)
     run, sent = Run(one), 0
-    for index in range(15 * 20):
-        now_ns = START_NS + round(index * SECOND_NS / 15)
+    for index, now_ns in frame_times(15 * 20):
         assert run.base(round(160_000 / 8 / 15), now_ns) == now_ns
         if index % 5 == 0:
             run.status(10_000 // 8 // 3, now_ns)

@@ -24,107 +24,92 @@ from rigs.messages import ANSWER, FEEDBACK, INFO_REQUEST, REQUEST
 
 
 def of_version(version: int, message: Message) -> bytes:
-    """The message as a ground of another version would have sealed it."""
     body = msgpack.packb([version, *msgpack.unpackb(message.pack())[1:-1], 2**32 - 1])[:-5]
     return body + b"\xce" + zlib.crc32(body).to_bytes(4, "big")
 
 
-def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
-    """A budget that a ground of last year set would be taken, and its answer not understood."""
-    reports: list[Feedback] = []
-    requests: list[object] = []
-    session, asked = MagicMock(), {}
-    monkeypatch.setattr(
-        publisher, "serve", lambda _session, channel, **told: asked.update({channel: told["answer"]})
-    )
-    listener = publisher.EdgeListener(
-        session,
-        EdgeKeys("uav-1"),
-        publisher.Answers(
+class Declared:
+    """A listener, and what it declares."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.channels, self.keys, self.answers = list[Channel](), list[str](), {}
+        self.reports, self.requests, self.now_s = list[Feedback](), [], 0.0
+        monkeypatch.setattr(publisher, "serve", self._serve)
+        answers = publisher.Answers(
             info=lambda _received_ns: b"info",
             control=lambda _request: ANSWER,
-            on_feedback=reports.append,
-            on_info_request=requests.append,
-        ),
-        failures=Failures(lambda: 7),
-        clock=lambda: 7,
-    )
-    report = session.declare_subscriber.call_args.args[1]
-    for version, taken in ((WIRE_VERSION - 1, 0), (WIRE_VERSION + 1, 0), (WIRE_VERSION, 1)):
-        assert bool(asked[Channel.CONTROL](of_version(version, REQUEST))) is bool(taken)
-        assert asked[Channel.INFO](of_version(version, INFO_REQUEST)) == b"info", (
-            "who asks is told the version"
+            on_feedback=self.reports.append,
+            on_info_request=self.requests.append,
         )
-        sample = SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda v=version: of_version(v, FEEDBACK)))
-        report(sample)
-        assert (len(reports), len(requests)) == (taken, taken)
-    assert listener.unusable == 6
+        self.listener = publisher.EdgeListener(
+            MagicMock(declare_subscriber=lambda key, take: self._note(Channel.FEEDBACK, key, take)),
+            EdgeKeys("uav-1"),
+            answers,
+            failures=Failures(lambda: 7),
+            clock=lambda: round(self.now_s * SECOND_NS),
+        )
+
+    def _serve(self, _session, channel, *, keys, answer, declared_as) -> MagicMock:
+        return self._note(channel, declared_as, answer)
+
+    def _note(self, channel: Channel, key: str, answer) -> MagicMock:
+        self.channels.append(channel)
+        self.keys.append(key)
+        self.answers[channel] = answer
+        return MagicMock()
+
+    def report(self, payload: bytes) -> None:
+        self.answers[Channel.FEEDBACK](SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload)))
+
+
+def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
+    """A budget that a ground of last year set would be taken, and its answer not understood."""
+    edge = Declared(monkeypatch)
+    info, control = edge.answers[Channel.INFO], edge.answers[Channel.CONTROL]
+    for version, taken in ((WIRE_VERSION - 1, 0), (WIRE_VERSION + 1, 0), (WIRE_VERSION, 1)):
+        assert bool(control(of_version(version, REQUEST))) is bool(taken)
+        assert info(of_version(version, INFO_REQUEST)) == b"info", "who asks is told the version"
+        edge.report(of_version(version, FEEDBACK))
+        assert (len(edge.reports), len(edge.requests)) == (taken, taken)
+    assert edge.listener.unusable == 6
+    # And none of the newer one on info, which says that it also speaks this one.
     said = (
         f"a ground speaks wire version {WIRE_VERSION - 1}, edge uav-1 reads {WIRE_VERSION}: update a ground"
     )
-    assert caplog.messages == [
-        said
-    ]  # and none of the newer one on info, which says that it also speaks this one
+    assert caplog.messages == [said]
     for junk in (b"", bytes(100_000), b"\x93\x01", FEEDBACK.pack()[:-1]) * 25:
-        report(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda junk=junk: junk)))
-        assert asked[Channel.CONTROL](junk) is None
-    assert (listener.unusable, len(reports)) == (206, 1)
+        edge.report(junk)
+        assert control(junk) is None
+    assert (edge.listener.unusable, len(edge.reports)) == (206, 1)
     assert len(caplog.messages) < 10, "a flood does not fill the log"
 
 
 def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
     """One datagram that UDP loses at the start would leave a ground without a picture, or its reports unheard."""
-    declared, keys, now_s = [], [], [0.0]
-
-    def serve(_session: object, channel: Channel, **told: object) -> MagicMock:
-        declared.append((channel, told["answer"]))
-        keys.append(told["declared_as"])
-        return MagicMock()
-
-    def subscribe(key: str, callback: object) -> MagicMock:
-        declared.append((Channel.FEEDBACK, callback))
-        keys.append(key)
-        return MagicMock()
-
-    monkeypatch.setattr(publisher, "serve", serve)
-    reports: list[Feedback] = []
-    answers = publisher.Answers(
-        info=lambda _received_ns: b"info", control=lambda _request: ANSWER, on_feedback=reports.append
-    )
-    listener = publisher.EdgeListener(
-        MagicMock(declare_subscriber=subscribe),
-        EdgeKeys("uav-1"),
-        answers,
-        failures=Failures(lambda: 7),
-        clock=lambda: round(now_s[0] * SECOND_NS),
-    )
+    edge = Declared(monkeypatch)
 
     def after(seconds: int, *, there: bool) -> tuple[int, int, int]:
-        before = len(declared)
+        before = len(edge.channels)
         for _ in range(seconds):
-            now_s[0] += 1
-            listener.declare_again(there=there)
-        channels = [channel for channel, _ in declared[before:]]
-        return tuple(channels.count(one) for one in (Channel.INFO, Channel.CONTROL, Channel.FEEDBACK))
+            edge.now_s += 1
+            edge.listener.declare_again(there=there)
+        new = edge.channels[before:]
+        return tuple(new.count(one) for one in (Channel.INFO, Channel.CONTROL, Channel.FEEDBACK))
 
     assert after(10, there=False) == (0, 0, 0)
     assert after(7, there=True) == (3, 2, 2)
-    for (channel, _), key in zip(declared, keys, strict=True):
+    for channel, key in zip(edge.channels, edge.keys, strict=True):
         met = {one for one in Channel if zenoh.KeyExpr(key).intersects(EdgeKeys("uav-1")[one])}
         assert met == {channel}
-    assert len(set(keys)) == len(keys), "a key whose number was lost is never understood again"
-    answer = next(answer for channel, answer in reversed(declared) if channel is Channel.INFO)
-    assert answer(b"") == b"info"
+    assert len(set(edge.keys)) == len(edge.keys), "a key whose number was lost is never understood again"
+    assert edge.answers[Channel.INFO](b"") == b"info"
     assert after(30, there=True) == (0, 2, 2), "it has asked, and reports nothing: it may only listen"
-    report = next(answer for channel, answer in reversed(declared) if channel is Channel.FEEDBACK)
-    report(SimpleNamespace(payload=SimpleNamespace(to_bytes=FEEDBACK.pack)))
-    assert len(reports) == 1
-    command = next(answer for channel, answer in reversed(declared) if channel is Channel.CONTROL)
-    assert command(REQUEST.pack())
+    edge.report(FEEDBACK.pack())
+    assert len(edge.reports) == 1
+    assert edge.answers[Channel.CONTROL](REQUEST.pack())
     assert after(100, there=True) == (0, 0, 0), "all is used"
-    assert (after(1, there=False), after(3, there=True)) == ((0, 0, 0), (1, 1, 1)), (
-        "another, or on another way"
-    )
+    assert after(1, there=False) == (0, 0, 0)
+    assert after(3, there=True) == (1, 1, 1), "another, or on another way"
 
 
 def test_who_wants_reports_alone_gets_them_over_udp(free_port):

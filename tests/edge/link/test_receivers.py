@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
@@ -17,21 +18,10 @@ SENT = (100, 100)
 def judged(
     primary: PrimaryReceiver, receiver: int, number: int, *, now_ns: int, base: int = -1, still: int = -1
 ) -> str:
-    """What is decided on one report, in a word."""
     said = feedback(receiver_id=receiver, sequence=number, base_sequence=base, still_sequence=still)
     report = primary.judge(said, sent=SENT, now_ns=now_ns)
     assert (report.feedback, report.now_ns) == (said, now_ns)
     return "first" if report.first else "next" if report.primary else "ignored"
-
-
-def test_the_newest_of_the_first_receiver_counts():
-    """Reports that overtake each other would take back what was acknowledged."""
-    primary = PrimaryReceiver()
-    assert judged(primary, 1, 4, now_ns=0) == "first"
-    assert judged(primary, 1, 5, now_ns=S // 10) == "next"
-    assert judged(primary, 1, 5, now_ns=S // 5) == "ignored"
-    assert judged(primary, 1, 3, now_ns=S // 5) == "ignored"
-    assert judged(primary, 2, 9, now_ns=S // 5) == "ignored"
 
 
 def test_another_takes_over_when_the_first_is_silent_or_has_no_news():
@@ -97,35 +87,41 @@ def test_who_reports_and_receives_nothing_makes_way_at_any_frame_rate():
         assert now_ns <= max(S, 3 * S // fps)
 
 
-def test_who_names_what_was_never_sent_does_not_count():
-    """One invented number would let the edge forget what no ground has, or steer its rate."""
-    primary = PrimaryReceiver()
-    assert judged(primary, 1, 0, now_ns=0, base=101) == "ignored"
-    assert judged(primary, 2, 0, now_ns=1, base=100, still=100) == "first", "the liar does not steer"
-
-
 def test_a_still_that_was_never_sent_ends_no_video():
     """A ground names a forged still for long: taken for silent, it would be stored for in place of live video."""
     forged = feedback(base_sequence=100, still_sequence=101, missing_stills=(99,))
     report = PrimaryReceiver().judge(forged, sent=SENT, now_ns=0)
     assert report.primary
-    named = report.feedback
-    assert (named.base_sequence, named.still_sequence, named.missing_stills) == (100, -1, ())
+    assert report.feedback == replace(forged, still_sequence=-1, missing_stills=())
 
 
-def test_a_number_that_was_forged_is_believed_for_a_second():
-    """One message would end acknowledgements, and the pace, for the rest of the flight."""
+@pytest.mark.parametrize(
+    "reports",
+    [
+        # Reports that overtake each other would take back what was acknowledged.
+        [
+            (1, 4, 0, "first"),
+            (1, 5, 0.1, "next"),
+            *((one, n, 0.2, "ignored") for one, n in ((1, 5), (1, 3), (2, 9))),
+        ],
+        # One invented number would let the edge forget what no ground has, or steer its rate.
+        [(1, 0, 0, "ignored", 101, -1), (2, 0, 0, "first", 100, 100)],
+        # One forged message would end acknowledgements, and the pace, for the rest of the flight.
+        [
+            *((1, 7, 0, "first"), (1, 2**32 - 1, 0, "next"), (1, 8, 0.5, "ignored")),
+            *((1, 15, 1.1, "first"), (1, 16, 1.2, "next")),
+        ],
+        # After an outage the first report would be taken for an old one.
+        [(1, 7, 0, "first"), None, (1, 1, 0.1, "first")],
+    ],
+    ids=["newest", "never sent", "forged", "outage"],
+)
+def test_the_newest_of_the_first_receiver_counts(reports):
     primary = PrimaryReceiver()
-    judged(primary, 1, 7, now_ns=0)
-    assert judged(primary, 1, 2**32 - 1, now_ns=1) == "next"
-    assert judged(primary, 1, 8, now_ns=S // 2) == "ignored"
-    assert judged(primary, 1, 15, now_ns=S + 1) == "first"
-    assert judged(primary, 1, 16, now_ns=S + 2) == "next"
-
-
-def test_after_an_outage_anybody_may_begin_anew():
-    """After an outage the first report would be taken for an old one."""
-    primary = PrimaryReceiver()
-    judged(primary, 1, 7, now_ns=0)
-    primary.forget()
-    assert judged(primary, 1, 1, now_ns=1) == "first"
+    for one in reports:
+        if one is None:
+            primary.forget()
+            continue
+        receiver, number, at_s, expected, *named = one
+        names = dict(zip(("base", "still"), named, strict=False))
+        assert judged(primary, receiver, number, now_ns=round(at_s * S), **names) == expected

@@ -17,7 +17,6 @@ PIXELS = np.zeros((8, 8, 3), np.uint8)
 def seen(
     index: int, *, ages=(0, 0), detected: bool = True, coded: bool = True, fps: float = 15
 ) -> AnalyzedFrame:
-    """Two tracks, last detected so many frames ago."""
     frame = Frame(index, START_NS + round(index * 1e9 / fps), PIXELS, PIXELS)
     count = len(ages)
     left = 10.0 * np.arange(count) + index
@@ -35,7 +34,6 @@ class Line:
         """Times at which the budget has no room."""
 
     def metadata(self, _channel, make, *, now_ns):
-        """Keeps what goes out."""
         if now_ns in self.full_ns:
             return False
         make(now_ns)
@@ -44,7 +42,6 @@ class Line:
 
 
 def told(shown: list[AnalyzedFrame], **settings) -> list[TrackStep]:
-    """What leaves the edge."""
     line = Line()
     reporter = TrackReporter(line, session_id=77, **settings)
     for one in shown:
@@ -57,6 +54,9 @@ def test_each_decision_step_is_told_and_nothing_else():
     steps = told([seen(index, detected=index % 5 == 0, coded=index % 2 == 0) for index in range(31)])
     assert [step.frame_index for step in steps] == [0, 5, 10, 15, 20, 25, 30]
     assert [step.sequence for step in steps] == list(range(7))
+    assert {(step.session_id, step.send_delay_ns) for step in steps} == {(77, 45_000_000)}, (
+        "the budget's time"
+    )
     assert [step.reference for step in steps] == [-1, 0, 1, -1, 3, 4, -1]
     decoder = TrackStepDecoder()
     for step in steps:
@@ -67,14 +67,6 @@ def test_each_decision_step_is_told_and_nothing_else():
         assert got.class_ids.tolist() == [0, 1]
 
 
-def test_the_time_of_sending_is_that_of_the_budget():
-    """Both ledgers would disagree about the windows."""
-    step = told([seen(3)])[0]
-    assert step.session_id == 77
-    assert step.capture_ns == seen(3).frame.capture_ns
-    assert step.send_delay_ns == 45_000_000
-
-
 def test_no_more_steps_than_allowed():
     """A detector on every frame would fill a thin link with boxes."""
     every = [seen(index) for index in range(45)]
@@ -83,17 +75,11 @@ def test_no_more_steps_than_allowed():
     assert len(told(every, most_per_s=100)) == 45
 
 
-def test_tracks_that_were_long_not_found_are_left_out():
-    """Ghosts would stand on the operator's screen."""
-    steps = told([seen(20, ages=(0, 6, 5, 19))])
-    assert TrackStepDecoder().decode(steps[0]).ids.tolist() == [1, 3]
-
-
-def test_an_empty_scene_is_told():
-    """The last tracks would stay on the screen for ever."""
-    steps = told([seen(0), seen(5, ages=())])
+def test_tracks_that_were_long_not_found_are_left_out_and_an_empty_scene_is_told():
+    """Ghosts, or the last tracks for ever, would stand on the operator's screen."""
     decoder = TrackStepDecoder()
-    assert [len(decoder.decode(step)) for step in steps] == [2, 0]
+    steps = told([seen(20, ages=(0, 6, 5, 19)), seen(25, ages=())])
+    assert [decoder.decode(step).ids.tolist() for step in steps] == [[1, 3], []]
 
 
 def test_a_step_without_room_is_left_out_and_the_next_is_understood():

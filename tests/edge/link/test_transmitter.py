@@ -15,7 +15,6 @@ from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
     MAX_ALSO,
     AlsoShown,
-    BaseHeader,
     CaptureTimes,
     Flags,
     RoiHeader,
@@ -26,7 +25,7 @@ from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.rate_control import RateController
 from hvt_edge.link.stills import Still
 from hvt_edge.video.encoder import STATUS_BYTES, base_overhead_bps
 from rigs.messages import STATUS, feedback, still_of
@@ -40,13 +39,13 @@ JPEG = "image/jpeg"
 class Out(Puts):
     """Which knows the line."""
 
-    def line_bytes(self, keys: EdgeKeys) -> int:
-        """What all of it takes on the line."""
+    def line_bytes(self) -> int:
+        keys = EdgeKeys("uav-1")
         return sum(
             len(payload)
-            + len(attachment)
-            + overhead_bytes(len(payload), len(attachment), key=keys[row], encoding=encoding)
-            for row, payload, attachment, encoding in self.puts
+            + len(extra)
+            + overhead_bytes(len(payload), len(extra), key=keys[row], encoding=encoding)
+            for row, payload, extra, encoding in self.puts
         )
 
 
@@ -57,21 +56,8 @@ class CountingBudget(RollingBudget):
         super().__init__(settings)
         self.sizes: list[int] = []
 
-    def record_base(
-        self, line_bytes: int, *, now_ns: int, keyframe: bool = False, stored: bool = False
-    ) -> None:
-        """As any budget does."""
-        super().record_base(line_bytes, now_ns=now_ns, keyframe=keyframe, stored=stored)
-        self.sizes.append(line_bytes)
-
-    def record_metadata(self, line_bytes: int, *, now_ns: int) -> None:
-        """As any budget does."""
-        super().record_metadata(line_bytes, now_ns=now_ns)
-        self.sizes.append(line_bytes)
-
-    def record_still(self, line_bytes: int, *, now_ns: int) -> None:
-        """As any budget does."""
-        super().record_still(line_bytes, now_ns=now_ns)
+    def record_other(self, line_bytes: int, now_ns: int) -> None:
+        super().record_other(line_bytes, now_ns)
         self.sizes.append(line_bytes)
 
 
@@ -83,51 +69,31 @@ class Rig:
     ) -> None:
         self.out, self.ledger, self.waits = Out(), Ledger(), []
         self.budget = CountingBudget(BudgetSettings(total_bps, round(total_bps * 0.8), fps=15))
-        self.sender = make_transmitter(
-            self.out,
-            ledger=self.ledger,
-            budget=self.budget,
-            session_id=2**32 - 1,
-            lockstep=lockstep,
-            wait_until=self.waits.append,
-            pacer=pacer,
-        )
+        parts = {"ledger": self.ledger, "budget": self.budget, "lockstep": lockstep, "pacer": pacer}
+        self.sender = make_transmitter(self.out, **parts, session_id=2**32 - 1, wait_until=self.waits.append)
 
 
 def unit(index: int, size: int = 1_000, *, keyframe: bool = False) -> AccessUnit:
-    """One access unit."""
     return AccessUnit(index, NOW_NS + index, bytes(size), keyframe=keyframe)
 
 
 def still(size: int = 100, **changes) -> Still:
-    """One still."""
-    fields = {
-        "frame_index": 3,
-        "capture_ns": NOW_NS,
-        "track_id": 5,
-        "box_source_px": (1.0, 2.0, 30.0, 40.0),
-        "crop_source_px": (0, 0, 34, 45),
-        "class_name": "car",
-        "confidence": 0.5,
-        "reason": "utility",
-    }
-    return still_of(bytes(size), **(fields | changes))
+    facts = {"frame_index": 3, "capture_ns": NOW_NS, "track_id": 5, "class_name": "car", "reason": "utility"}
+    place = {"box_source_px": (1.0, 2.0, 30.0, 40.0), "crop_source_px": (0, 0, 34, 45), "confidence": 0.5}
+    return still_of(bytes(size), **(facts | place | changes))
 
 
 def send_status(rig, make, **how) -> bool:
-    """Once, as `make` makes it."""
     return rig.sender.metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), **how)
 
 
 def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
-    """A report with so many reasons."""
     counts = {f"{name}{number}": 4_000_000_000 for number in range(reasons)}
     known = replace(STATUS, session_id=2**32 - 1, send_ns=at_ns, media_ns=max(0, at_ns - NOW_NS))
     return replace(known, sent=counts, deferred=counts, dropped=counts, failed=(), decisions="")
 
 
 def send_units(rig, *keyframes: int, until: int, size: int = 1_000) -> int:
-    """So many, 66 ms apart; when the next is due."""
     for index in range(until):
         now_ns = NOW_NS + 66_000_000 * index
         rig.sender.base(unit(index, size, keyframe=index in keyframes), now_ns=now_ns)
@@ -148,7 +114,7 @@ def test_what_a_ground_misses_goes_once_more_as_it_was():
         assert (header.frame_index, header.send_ns) == (header.sequence, now_ns)
     ledger = rig.sender.ledger
     assert ledger.messages(Account.BASE) == 6, "a ground that has all has so many"
-    assert ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
+    assert ledger.line_bytes == rig.out.line_bytes()
     rig.sender.in_flight.on_report(5, (3,))
     rig.sender.resend((2, 3), now_ns=now_ns + 790_000_000)
     assert [one.sequence for one in rig.out.base[8:]] == [3], "lost again"
@@ -184,55 +150,33 @@ def test_repetitions_keep_to_the_budget_and_to_a_share_of_it():
 
 
 def test_a_base_message_says_what_the_ground_needs():
-    """The ground could not order, check or date the pictures."""
+    """The ground could not order, check or date the pictures, or would show media time as delay."""
     rig = Rig()
     rig.sender.base(unit(4, keyframe=True), now_ns=NOW_NS + 100)
     rig.sender.base(unit(7), now_ns=NOW_NS + 200)
-    headers = [BaseHeader.parse(attachment, payload) for _, payload, attachment, _ in rig.out.puts]
-    assert [one.sequence for one in headers] == [0, 1]
-    assert [one.frame_index for one in headers] == [4, 7]
-    assert [one.keyframe for one in headers] == [True, False]
-    assert headers[0].flags == Flags.KEYFRAME | Flags.PARAMETER_SETS
-    assert headers[1].flags == 0
-    assert [one.capture_ns for one in headers] == [NOW_NS + 4, NOW_NS + 7]
-    assert [one.send_ns for one in headers] == [NOW_NS + 100, NOW_NS + 200]
-    assert {one.session_id for one in headers} == {2**32 - 1}
+    told = [
+        (one.session_id, one.sequence, one.frame_index, one.capture_ns, one.send_ns) for one in rig.out.base
+    ]
+    assert told == [
+        (2**32 - 1, 0, 4, NOW_NS + 4, NOW_NS + 100),
+        (2**32 - 1, 1, 7, NOW_NS + 7, NOW_NS + 200),
+    ]
+    assert [one.flags for one in rig.out.base] == [Flags.KEYFRAME | Flags.PARAMETER_SETS, 0]
     assert [encoding for *_, encoding in rig.out.puts] == ["video/h265"] * 2
     assert rig.sender.base_sequence == 1
-
-
-def test_lockstep_is_flagged():
-    """The ground would show media time as delay."""
-    rig = Rig(lockstep=True)
-    rig.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
-    rig.sender.still(still(), now_ns=NOW_NS)
-    (_, payload, attachment, _), (_, data, roi, _) = rig.out.puts
-    assert BaseHeader.parse(attachment, payload).flags == 7
-    assert RoiHeader.parse(roi, data).flags == Flags.LOCKSTEP
+    lockstep = Rig(lockstep=True)
+    lockstep.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
+    lockstep.sender.still(still(), now_ns=NOW_NS)
+    assert (lockstep.out.base[0].flags, lockstep.out.stills[0][0].flags) == (7, Flags.LOCKSTEP)
 
 
 def test_a_still_says_what_it_shows():
     """The ground could not place it."""
-    rig = Rig()
-    sent = still(sequence=6)
+    rig, sent = Rig(), still(sequence=6)
     rig.sender.still(sent, now_ns=NOW_NS + 50)
-    ((row, payload, attachment, encoding),) = rig.out.puts
-    header = RoiHeader.parse(attachment, payload)
-    assert (row, payload, encoding) == (Channel.ROI, sent.data, JPEG)
-    for name in (
-        "sequence",
-        "frame_index",
-        "capture_ns",
-        "track_id",
-        "crop_source_px",
-        "class_name",
-        "reason",
-        "codec",
-    ):
-        assert getattr(header, name) == getattr(sent.header, name)
-    assert header.box_source_px == sent.header.box_source_px
-    assert (header.confidence, header.quality_pct, header.send_ns) == (0.5, 65, NOW_NS + 50)
-    assert rig.sender.still_sequence == 6
+    ((header, payload),) = rig.out.stills
+    assert header == replace(sent.header, session_id=2**32 - 1, send_delay_ns=50)
+    assert (payload, rig.out.puts[0][3], rig.sender.still_sequence) == (sent.data, JPEG, 6)
 
 
 def test_the_ledger_counts_the_very_bytes_that_were_put():
@@ -248,10 +192,9 @@ def test_the_ledger_counts_the_very_bytes_that_were_put():
             rig.sender.still(still(300 + index, sequence=index // 3), now_ns=now_ns)
         if index % 15 == 0:
             send_status(rig, lambda at_ns: status(at_ns, reasons=3), now_ns=now_ns)
-    puts = rig.out.puts
-    assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
-    assert rig.ledger.base_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Channel.BASE)
-    assert rig.ledger.roi_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Channel.ROI)
+    assert rig.ledger.line_bytes == rig.out.line_bytes()
+    assert rig.ledger.base_bytes == sum(map(len, rig.out.units))
+    assert rig.ledger.roi_bytes == sum(len(data) for _, data in rig.out.stills)
     assert [rig.ledger.messages(one) for one in Account] == [30, 10, 0, 2]
     assert rig.ledger.line_bytes == sum(rig.budget.sizes)
 
@@ -263,9 +206,7 @@ def test_what_finds_no_room_is_sent_when_there_is_and_says_so():
     rig.sender.base(unit(1, 6_000), now_ns=NOW_NS + 100)
     send_status(rig, status, now_ns=NOW_NS + 200, last=True)
     assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS, NOW_NS + SECOND_NS]
-    (_, _, _, _), (_, payload, attachment, _), (_, report, _, _) = rig.out.puts
-    assert BaseHeader.parse(attachment, payload).send_ns == NOW_NS + SECOND_NS
-    assert Status.parse(report).send_ns == NOW_NS + SECOND_NS
+    assert rig.out.base[1].send_ns == Status.parse(rig.out.puts[2][1]).send_ns == NOW_NS + SECOND_NS
     assert rig.ledger.worst_window_bps.total <= 80_000
 
 
@@ -298,31 +239,20 @@ def test_a_still_of_just_the_room_takes_just_the_room(  # noqa: PLR0917 - hypoth
     now_ns = NOW_NS + late_ns
     if spend:
         rig.sender.base(unit(0, spend), now_ns=now_ns)
-    asked = still(
-        0,
-        sequence=sequence,
-        frame_index=frame,
-        track_id=track,
-        class_name=class_name,
-        reason=reason,
-        codec=codec,
-        confidence=0.9994,
-        quality_pct=100,
-        box_source_px=box,
-        crop_source_px=(far, far, far + 700, far + 700),
-        media_type=media_type,
-        parameters=parameters,
-        also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in also),
-    )
+    names = {"class_name": class_name, "reason": reason, "codec": codec, "media_type": media_type}
+    numbers = {"sequence": sequence, "frame_index": frame, "track_id": track, "confidence": 0.9994}
+    place = {"box_source_px": box, "crop_source_px": (far, far, far + 700, far + 700), "quality_pct": 100}
+    others = tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in also)
+    asked = still(0, **names, **numbers, **place, parameters=parameters, also=others)
     room_line = rig.budget.still_allowance(now_ns)
     room = rig.sender.still_allowance_bytes(now_ns, still=asked)
     before = rig.ledger.line_bytes
     rig.sender.still(replace(asked, data=bytes(room)), now_ns=now_ns)
-    _, payload, attachment, encoding = rig.out.puts[-1]
+    encoding = rig.out.puts[-1][3]
     assert encoding == ("application/octet-stream" if "hvt" in media_type else media_type)
     taken = rig.ledger.line_bytes - before
     assert room == 0 or room_line - 72 <= taken <= room_line, "short by a header of TCP and one of a fragment"
-    header = RoiHeader.parse(attachment, payload)
+    header, _ = rig.out.stills[-1]
     if class_name.isprintable():
         assert class_name.startswith(header.class_name)
         assert len(header.class_name.encode()) > 60 or header.class_name == class_name
@@ -333,8 +263,7 @@ def test_a_still_is_stamped_and_counted_when_it_goes_not_when_its_coding_began()
     rig = Rig()
     rig.sender.clock = lambda: NOW_NS + 400_000_000
     rig.sender.still(still(), now_ns=NOW_NS)
-    header = RoiHeader.parse(rig.out.puts[0][2], rig.out.puts[0][1])
-    assert header.send_ns == NOW_NS + 400_000_000
+    assert rig.out.stills[0][0].send_ns == NOW_NS + 400_000_000
     assert not rig.budget.fits(99_900, now_ns=NOW_NS + SECOND_NS + 200_000_000)
 
 
@@ -370,7 +299,7 @@ def test_what_is_no_frame_waits_for_nothing_and_leaves_the_next_frame_its_room(c
     row, _, attachment, encoding = rig.out.puts[-1]
     assert (row, attachment, encoding) == (channel, b"", DELIVERIES[channel].encoding)
     assert rig.ledger.messages(Account.META) == 1
-    assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
+    assert rig.ledger.line_bytes == rig.out.line_bytes()
     assert rig.ledger.line_bytes == sum(rig.budget.sizes)
 
 
@@ -378,8 +307,9 @@ def test_a_status_that_has_waited_long_goes_before_the_next_frame():
     """Where video takes all that there is, a ground would take the edge for gone."""
     rig = Rig(total_bps=80_000)
     rig.sender.base(unit(0, 9_150, keyframe=True), now_ns=NOW_NS)
-    assert not send_status(rig, status, now_ns=NOW_NS + 100)
-    assert send_status(rig, status, now_ns=NOW_NS + 100, before_frames=True)
+    assert [send_status(rig, status, now_ns=NOW_NS + 100, before_frames=late) for late in (False, True)] == [
+        False, True,
+    ]  # fmt: skip
     assert rig.ledger.worst_window_bps.total <= 80_000
 
 
@@ -428,7 +358,7 @@ def test_what_is_set_aside_for_headers_and_status_suffices():
 
 def test_two_threads_keep_one_account():
     """Real-time runs would lose bytes from the ledger, or crash while a report is made."""
-    rig, keys = Rig(total_bps=400_000_000), EdgeKeys("uav-1")
+    rig = Rig(total_bps=400_000_000)
 
     def stills() -> None:
         for number in range(1_500):
@@ -450,13 +380,8 @@ def test_two_threads_keep_one_account():
             if number % 10 == 0:
                 send_status(rig, report, now_ns=now_ns)
     done.result()
-    assert rig.ledger.line_bytes == rig.out.line_bytes(keys)
-    sequences = [
-        BaseHeader.parse(attachment, payload).sequence
-        for row, payload, attachment, _ in rig.out.puts
-        if row is Channel.BASE
-    ]
-    assert sequences == list(range(1_500))
+    assert rig.ledger.line_bytes == rig.out.line_bytes()
+    assert [one.sequence for one in rig.out.base] == list(range(1_500))
     assert sum(rig.ledger.outcomes("deferred").values()) == 1_500
     assert sum(rig.ledger.outcomes("sent").values()) == rig.ledger.messages(Account.ROI) > 0
 
@@ -483,20 +408,17 @@ def test_a_second_copy_has_the_same_number_and_bytes_and_is_counted():
     now_ns = NOW_NS + 2_000_000
     line_bytes, allowance = rig.ledger.line_bytes, rig.sender.still_allowance_bytes(now_ns)
     rig.sender.still(stills[1], now_ns=now_ns, copy="again")
-    (_, data, attachment, _), (_, again, second, _) = rig.out.puts[1], rig.out.puts[3]
-    header, copy = RoiHeader.parse(attachment, data), RoiHeader.parse(second, again)
+    (header, data), (copy, again) = rig.out.stills[1], rig.out.stills[3]
     assert data == again
     assert copy == replace(header, send_delay_ns=copy.send_delay_ns)
-    assert copy.send_ns == now_ns
-    assert rig.sender.still_sequence == 2
-    assert rig.ledger.messages(Account.ROI) == 4
+    assert (copy.send_ns, rig.sender.still_sequence, rig.ledger.messages(Account.ROI)) == (now_ns, 2, 4)
     assert rig.ledger.line_bytes - line_bytes > 400
     assert rig.sender.still_allowance_bytes(now_ns) < allowance - 400
 
 
 def test_a_second_copy_does_not_confuse_the_pacer():
     """It would take reports for those of stills that were never sent, and the rate would fall to its floor."""
-    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    pacer = Pacer(RateController(ceiling_bps=800_000, floor_bps=100_000))
     pacer.link(True, now_ns=NOW_NS)
     rig = Rig(pacer=pacer)
     stills = [still(400, sequence=sequence) for sequence in range(3)]
@@ -514,12 +436,10 @@ def test_a_second_copy_does_not_confuse_the_pacer():
 def test_a_stored_still_has_the_bytes_that_it_would_have_had():
     """The ground could not place what comes back after an outage."""
     rig = Rig()
-    one = still(400)
-    rig.sender.still(one, now_ns=NOW_NS)
-    stored = rig.sender.store_still(one, now_ns=NOW_NS)
-    (_, data, attachment, encoding) = rig.out.puts[0]
-    assert (stored.payload, stored.encoding) == (data, encoding)
-    sent = RoiHeader.parse(attachment, data)
+    rig.sender.still(still(400), now_ns=NOW_NS)
+    stored = rig.sender.store_still(still(400), now_ns=NOW_NS)
+    ((sent, data),) = rig.out.stills
+    assert (stored.payload, stored.encoding) == (data, rig.out.puts[0][3])
     assert RoiHeader.parse(stored.attachment, data) == replace(sent, flags=Flags.STORED)
 
 
@@ -530,19 +450,18 @@ def test_the_time_of_a_frame_that_was_sent_is_not_sent_again():
     for one in (still(), still(frame_index=4), still(parameters={"ask": 1})):
         rig.sender.still(one, now_ns=NOW_NS)
     stored = rig.sender.store_still(still(), now_ns=NOW_NS)
-    base, *sent = [(attachment, data) for _, data, attachment, _ in rig.out.puts]
-    headers = [RoiHeader.parse(attachment, data) for attachment, data in sent]
+    (base,), headers = rig.out.base, [header for header, _ in rig.out.stills]
     assert [one.capture_ns for one in headers] == [-1, NOW_NS, NOW_NS]
     assert RoiHeader.parse(stored.attachment, stored.payload).capture_ns == NOW_NS
     captures = CaptureTimes()
     assert captures.filled(headers[0], otherwise_ns=7).capture_ns == 7, "nothing is known yet"
-    captures.note(BaseHeader.parse(*base))
+    captures.note(base)
     assert captures.filled(headers[0], otherwise_ns=7).capture_ns == NOW_NS + 3
     lost = replace(headers[0], frame_index=9)
     assert captures.filled(lost, otherwise_ns=7).capture_ns == NOW_NS + 3, "that of the nearest"
     assert captures.filled(headers[1], otherwise_ns=7) is headers[1]
     assert captures.filled(replace(headers[0], session_id=9), otherwise_ns=2**64).capture_ns == 2**63 - 1
-    captures.note(replace(BaseHeader.parse(*base), frame_index=5, capture_ns=NOW_NS + 203))
+    captures.note(replace(base, frame_index=5, capture_ns=NOW_NS + 203))
     assert captures.filled(lost, otherwise_ns=7).capture_ns == NOW_NS + 603, "by the rate of the two nearest"
 
 
@@ -553,7 +472,7 @@ def test_a_class_that_the_session_lists_is_sent_as_its_place_there():
     for one in (still(), still(class_name="tram"), still(parameters={"ask": 1})):
         rig.sender.still(one, now_ns=NOW_NS)
     stored = rig.sender.store_still(still(), now_ns=NOW_NS)
-    headers = [RoiHeader.parse(attachment, data) for _, data, attachment, _ in rig.out.puts]
+    headers = [header for header, _ in rig.out.stills]
     assert [one.class_name for one in headers] == [1, "tram", "car"]
     assert [one.named(names).class_name for one in headers] == ["car", "tram", "car"]
     assert RoiHeader.parse(stored.attachment, stored.payload).class_name == "car"

@@ -26,29 +26,18 @@ class Rig:
         self.control = AutoControl(self.operating, replace(SETTINGS, finer=finer))
         self.at_s = 0
 
-    def tracks(
-        self,
-        gain: float,
-        *,
-        comparisons: float = 3.0,
-        misnamed_share: float = 0.0,
-        sure_gain: float | None = None,
-    ) -> bool:
-        """Whether tracks are sent after a second in which this was measured."""
-        sure_gain = gain if sure_gain is None else sure_gain
+    def tracks(self, gain: float, **measured: float) -> bool:
         self.control.measured = Measured(
-            comparisons, gain, sure_gain, hidden=4, misnamed_share=misnamed_share
+            **{"comparisons": 3.0, "sure_gain": gain, "hidden": 4} | measured, gain=gain
         )
         return self.second().tracks
 
     def answers(self, count: int, *, changed: int = 0) -> bool:
-        """Whether stills are sent after so many were answered."""
         for number in range(count):
             self.control.take_answer(changed=number < changed)
         return self.second().stills
 
     def second(self, seconds: int = 1):
-        """The decisions so much later."""
         self.at_s += seconds
         self.control.decide(self.at_s * SECOND_NS)
         says = self.operating.now.decisions.says
@@ -122,25 +111,25 @@ def test_what_it_says_has_room_in_a_report():
     assert dict(kinds(Status))["decisions"].decode(says) == says, "a report refuses what is longer"
 
 
-def test_one_picture_is_no_measurement_unless_it_is_plain():
-    """The first pictures of a stream hide everything: tracks would begin on every clip."""
-    rig = Rig()
-    assert not rig.tracks(0.0, comparisons=0.0), "nothing was measured yet"
-    assert not rig.tracks(0.1, comparisons=1.0)
-    assert rig.tracks(0.3, comparisons=1.0)
-
-
-def test_what_is_not_sure_brings_no_tracks_unless_it_is_plain():
-    """One object that the detector imagines among many would; the only one there is must."""
-    assert not Rig().tracks(0.1, sure_gain=0.0)
-    assert Rig().tracks(0.8, sure_gain=0.0)
-
-
-def test_on_a_thinner_link_tracks_must_give_more():
-    """8 kbps are a tenth of 80 kbps and nothing of 1400: video would gain by them."""
-    gain = SETTINGS.least_gain + 0.004
-    assert Rig(budget_bps=1_400_000).tracks(gain)
-    assert not Rig(budget_bps=60_000).tracks(gain)
+@pytest.mark.parametrize(
+    ("budget_bps", "gain", "measured", "sent"),
+    [
+        # The first pictures of a stream hide everything: tracks would begin on every clip.
+        (800_000, 0.0, {"comparisons": 0.0}, False),
+        (800_000, 0.1, {"comparisons": 1.0}, False),
+        (800_000, 0.3, {"comparisons": 1.0}, True),
+        # One object that the detector imagines among many would bring them; the only one there is must.
+        (800_000, 0.1, {"sure_gain": 0.0}, False),
+        (800_000, 0.8, {"sure_gain": 0.0}, True),
+        # 8 kbps are a tenth of 80 kbps and nothing of 1400: video would gain by them.
+        (1_400_000, SETTINGS.least_gain + 0.004, {}, True),
+        (60_000, SETTINGS.least_gain + 0.004, {}, False),
+    ],
+)
+def test_tracks_begin_where_their_gain_is_sure_or_plain_and_worth_their_bits(
+    budget_bps, gain, measured, sent
+):
+    assert Rig(budget_bps=budget_bps).tracks(gain, **measured) is sent
 
 
 def test_stills_that_change_nothing_pause_and_are_tried_again():
@@ -154,6 +143,15 @@ def test_stills_that_change_nothing_pause_and_are_tried_again():
     assert not rig.answers(SETTINGS.least_answers), "in vain"
     assert not rig.second(2 * pause_s - 1).stills, "the next try comes later"
     assert rig.second(1).stills
+    assert not rig.answers(SETTINGS.least_answers)
+    rig.tracks(0.0, misnamed_share=0.3)
+    assert rig.operating.now.decisions.stills, "without tracks a right name reaches the ground by them alone"
+    rig.control.forget()
+    decisions = rig.second()
+    assert decisions.stills, "what was measured on the ground says nothing of the sky"
+    assert decisions.says.startswith("no tracks: not measured yet")
+    assert rig.answers(SETTINGS.most_answers, changed=5), "the next one may be the one that matters"
+    assert "stills: they name 5 of 40 otherwise" in rig.operating.now.decisions.says
 
 
 def test_stills_of_a_source_much_finer_than_the_base_never_pause():
@@ -165,41 +163,13 @@ def test_stills_of_a_source_much_finer_than_the_base_never_pause():
     assert not rig.second().stills, "but on a machine that is too slow"
 
 
-def test_stills_that_change_something_go_on():
-    """The next one may be the one that matters."""
-    rig = Rig()
-    assert rig.answers(SETTINGS.most_answers, changed=5)
-    assert "stills: they name 5 of 40 otherwise" in rig.operating.now.decisions.says
-
-
-def test_stills_go_on_where_the_base_misnames_and_no_tracks_tell():
-    """They are then the only way by which a right name reaches the ground, whatever the edge thinks of them."""
-    rig = Rig()
-    assert rig.answers(SETTINGS.most_answers) is False
-    rig.tracks(0.0, misnamed_share=0.3)
-    assert rig.operating.now.decisions.stills
-
-
-def test_another_scene_begins_anew():
-    """What was measured on the ground says nothing of the sky."""
-    rig = Rig()
-    rig.tracks(0.1)
-    assert not rig.answers(SETTINGS.least_answers)
-    rig.control.forget()
-    decisions = rig.second()
-    assert decisions.stills
-    assert decisions.says.startswith("no tracks: not measured yet")
-
-
 def test_a_machine_that_is_too_slow_sends_video_alone_and_says_so():
     """Perception that never comes to a frame would leave the last decisions for ever."""
     rig = Rig()
     rig.tracks(0.1)
     rig.control.take_load(too_slow=True, now_ns=SECOND_NS)
     decisions = rig.operating.now.decisions
-    assert not decisions.tracks
-    assert not decisions.stills
-    assert "too slow" in decisions.says
+    assert (decisions.tracks, decisions.stills, "too slow" in decisions.says) == (False, False, True)
     rig.control.take_load(too_slow=False, now_ns=2 * SECOND_NS)
     assert rig.tracks(0.1), "it has time again"
 

@@ -6,23 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_common.values import Tracks, View
+from hvt_common.values import View
 from hvt_edge.perception.candidates import MOST_PSNR_DB, BaseLoss, TrackMemory, measure_loss, sharpness
 from rigs.examples import tracks_of
 
 VIEW = View.fitted((1280, 720), (640, 360), fit="letterbox")
 
 
-def tracks(*boxes: tuple[float, float, float, float]) -> Tracks:
-    """Confirmed cars, boxes in base pixels."""
-    return tracks_of(0, boxes, confidences=0.8, started=True)
-
-
 def candidates(*boxes: tuple[float, float, float, float], **pictures):
-    """The candidates of one step."""
-    return TrackMemory().candidates(
-        tracks(*boxes), view=VIEW, class_names=("car",), now_ns=10**18, **pictures
-    )
+    tracks = tracks_of(0, boxes, confidences=0.8, started=True)
+    return TrackMemory().candidates(tracks, view=VIEW, class_names=("car",), now_ns=10**18, **pictures)
 
 
 def test_only_what_stands_in_front_covers():
@@ -63,11 +56,7 @@ def test_without_pictures_nothing_is_measured():
     assert candidates((100, 100, 140, 140), source_bgr=source)[0].loss is None
 
 
-# What the base lost of a crop: known answers.
-
-
 def texture(size: tuple[int, int] = (60, 80)) -> np.ndarray:
-    """Edges and noise; (height, width)."""
     rng = np.random.default_rng(1)
     blocks = rng.integers(40, 215, (size[0] // 4 + 1, size[1] // 4 + 1, 3), dtype=np.uint8)
     return np.ascontiguousarray(blocks.repeat(4, 0).repeat(4, 1)[: size[0], : size[1]])

@@ -15,7 +15,7 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Frame
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
-from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround
+from hvt_edge.perception.shadow import Detected, GroundDifference, Shadow, ShadowGround
 from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder import encoder_settings
@@ -23,23 +23,21 @@ from hvt_edge.video.x265 import BaseEncoder
 from rigs.examples import detections, tracks_of
 
 FPS = 15
-PERIOD_NS = 1_000_000_000 // FPS
+S = 1_000_000_000
+PERIOD_NS = S // FPS
 CONFIDENCE = 0.4
 PICTURE = np.random.default_rng(3).integers(0, 255, (64, 96, 3), np.uint8)
 
 
 def box(place: int) -> list[float]:
-    """Of the object at this place."""
     return [10.0 * place, 0.0, 10.0 * place + 8, 8.0]
 
 
 def found(*places: int, confidence: float = 0.8, class_id: int = 0) -> Detections:
-    """What the detector says of the base."""
     return detections([box(place) for place in places], confidence, class_id)
 
 
 def seen(index: int, confidences: dict[int, float], scene_began: int = -1) -> AnalyzedFrame:
-    """A decision step whose source shows objects at these places."""
     boxes = {place: box(place) for place in confidences}
     tracks = tracks_of(index, boxes, confidences=[confidences[place] for place in sorted(boxes)])
     frame = Frame(index=index, capture_ns=(index + 1) * PERIOD_NS, source_bgr=PICTURE, base_bgr=PICTURE)
@@ -47,7 +45,6 @@ def seen(index: int, confidences: dict[int, float], scene_began: int = -1) -> An
 
 
 def compared(*answers: Detections, confidences: dict[int, float], every: int = 30) -> ShadowGround:
-    """A shadow ground whose detector said this of the base, one look after the other."""
     left = list(answers)
     shadow = ShadowGround(lambda _image: left.pop(0) if left else found(), confidence=CONFIDENCE)
     assert not shadow.compare(seen(0, confidences)), "the first picture is coarser than any other"
@@ -119,7 +116,6 @@ TWENTY = dict.fromkeys(range(20), 0.9)
 def reporting(
     shown: int, detected: int, *, objects: dict[int, float] | None = None, seconds: int = 10
 ) -> ShadowGround:
-    """So many of twenty objects are shown by the base to the edge's detector, and so many detected at the ground."""
     objects = TWENTY if objects is None else objects
     shadow = ShadowGround(lambda _image: found(*range(shown)), confidence=CONFIDENCE)
     for index in range(0, 15 * seconds, 5):
@@ -195,34 +191,23 @@ def test_reports_of_the_scene_before_say_nothing_of_this_one():
     assert shadow.scene_began == 150
 
 
-@given(
-    st.floats(0, 300),
-    st.floats(0, 300),
-    st.floats(0, 300),
-    st.floats(-70_000, 70_000),
-    st.floats(0.01, 1),
-    st.floats(0, 1),
-    st.floats(0, 1),
-    st.booleans(),
-)
+COUNT, SHARE = st.floats(0, 300), st.floats(0, 1)
+
+
+@given(COUNT, COUNT, COUNT, st.floats(-70_000, 70_000), st.floats(0.01, 1), SHARE, SHARE, st.booleans())
 def test_whatever_a_ground_reports_no_object_is_made_up(
     shown, hidden, false, more, p, misnamed, suppressed, sure
 ):
     """A ground that lies may have tracks sent or not; it can put nothing into the account that is not there."""
-    before = Shadow(
-        comparisons=3,
-        source_p=p * (shown + hidden),
-        shown=shown,
-        shown_p=p * shown,
-        hidden=hidden,
-        hidden_p=p * hidden,
-        misnamed=misnamed * shown,
-        misnamed_p=misnamed * p * shown,
-        false=false,
-        false_p=p * false,
-        suppressed=suppressed * false,
-        suppressed_p=suppressed * p * false,
-    )
+    counts = {
+        "shown": shown,
+        "hidden": hidden,
+        "misnamed": misnamed * shown,
+        "false": false,
+        "suppressed": suppressed * false,
+    }
+    sums = {f"{name}_p": p * count for name, count in counts.items()}
+    before = Shadow(comparisons=3, source_p=p * (shown + hidden), **counts, **sums)
     after = before.corrected(more, sure=sure)
     assert after.shown + after.hidden == pytest.approx(shown + hidden)
     assert after.shown_p + after.hidden_p == pytest.approx(before.source_p)
@@ -291,23 +276,51 @@ def test_a_thin_base_hides_what_a_rich_one_shows():
 
 
 def _measured(detector: Detector, source: DemoSource, frames: list[Frame], kbps: int) -> float:
-    settings = encoder_settings(
-        size=source.view.base_size,
-        fps=FPS,
-        preset="veryfast",
-        total_bps=1000 * kbps,
-        base_bps=1000 * kbps,
-        edge_id="edge-1",
-    )
+    rates = {"total_bps": 1000 * kbps, "base_bps": 1000 * kbps, "edge_id": "edge-1"}
+    settings = encoder_settings(size=source.view.base_size, fps=FPS, preset="veryfast", **rates)
     shadow, encoder = ShadowGround(detector.detect, confidence=CONFIDENCE), BaseEncoder(settings)
-    analyzer = Analyzer(
-        detector,
-        ByteTracker(TrackerSettings.starting_at(0.4, camera_motion="off"), fps=FPS),
-        view=source.view,
-        candidates="source",
-    )
+    tracker = ByteTracker(TrackerSettings.starting_at(0.4, camera_motion="off"), fps=FPS)
+    analyzer = Analyzer(detector, tracker, view=source.view, candidates="source")
     for frame in frames:
         shadow.compare(analyzer.analyze(frame, encoder.encode(frame)))
     assert shadow.now.comparisons > 1
     assert shadow.now.source_p > 5, "there is something to see"
     return shadow.now.gain
+
+
+def told(one: GroundDifference, *counts: int, at_s: int = 0, receiver_id: int = 1) -> GroundDifference:
+    # Ten are found here once a second, a report of each at once.
+    for second, count in enumerate(counts, at_s):
+        one.expect(second * FPS, 10, capture_ns=second * S)
+        one.take(Detected(receiver_id, second * FPS + 2, count))
+    return one
+
+
+@pytest.mark.parametrize(("counts", "mean"), [((2,), None), ((2, 12), 2), ((2, 12, 14), 3.06)])
+def test_the_mean_of_what_was_reported_after_the_first_second(counts, mean):
+    """The first picture of a stream is coarse: each flight would begin as if the ground saw little."""
+    assert told(GroundDifference(), *counts).mean == (mean and pytest.approx(mean, abs=0.01))
+
+
+def test_a_report_counts_for_the_picture_that_it_covers():
+    """A scene that fills or empties would be a difference between two detectors."""
+    one = told(GroundDifference(), 10, 10)
+    one.expect(40, 30, capture_ns=3 * S)
+    for frame, count in (
+        (39, 10),
+        (41, 30),
+        (41, 0),
+    ):  # before that picture; of it; again, as of one that hangs
+        one.take(Detected(1, frame, count))
+        assert one.mean == 0
+
+
+def test_a_ground_that_says_no_more_or_is_another_is_forgotten():
+    """One that has left, or that has no detector, would speak for one that has it."""
+    quiet, other = (told(GroundDifference(), *[0] * 20) for _ in range(2))
+    assert quiet.mean == pytest.approx(-10)
+    for second in range(20, 60):
+        quiet.expect(second * FPS, 10, capture_ns=second * S)
+    assert quiet.mean is None
+    assert told(other, 10, at_s=20, receiver_id=2).mean is None
+    assert told(other, 10, at_s=21, receiver_id=2).mean == 0

@@ -74,9 +74,6 @@ def test_numbers_that_a_report_cannot_say_end_no_flight():
     assert (health.encode_ms, health.detect_ms, health.feedback_age_ms) == (60_000, 60_000, 2**32 - 1)
 
 
-# What the machine tells of itself, as Linux writes it.
-
-
 WIRELESS = """\
 Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE
  face | tus | link level noise |  nwid  crypt   frag  retry   misc | beacon | 22
@@ -85,7 +82,6 @@ Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE
 
 
 def written(root: Path, *, zones: tuple[str, ...], wireless: str) -> Path:
-    """A machine with these sensors."""
     for number, text in enumerate(zones):
         zone = root / f"sys/class/thermal/thermal_zone{number}"
         zone.mkdir(parents=True)

@@ -27,7 +27,6 @@ pytestmark = pytest.mark.integration
 
 @pytest.fixture
 def address() -> str:
-    """Where an edge answers."""
     return f"127.0.0.1:{free_ports(1)[0]}"
 
 
@@ -83,6 +82,11 @@ def test_a_camera_that_went_away_is_no_dead_process_and_is_said(tmp_path, addres
             eventually(lambda: asked(address, "/readyz")[0] == 200, what="pictures come again")
 
 
+def config_of(scene, port: int, **settings) -> EdgeConfig:
+    plain = {"source": str(scene), "fps": 5.0, "size": (320, 192), "wait": 0.0}
+    return check(EdgeConfig(**plain, listen=(f"tcp/127.0.0.1:{port}",), **settings))
+
+
 class HangingWorld(World):
     """Whose source gives some frames, and then never one again."""
 
@@ -91,7 +95,6 @@ class HangingWorld(World):
         self._end = end
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """See there."""
         return PassedOn(
             super().open_source(config), before=lambda frame: frame.index == 10 and self._end.wait()
         )
@@ -100,19 +103,7 @@ class HangingWorld(World):
 def test_a_loop_that_hangs_tells_nobody_that_it_lives(tmp_path, address, free_port, monkeypatch, long_scene):
     """Nobody would ever start it again, and the picture stand still until somebody lands the drone."""
     name = str(tmp_path / "notify")
-    config = check(
-        EdgeConfig(
-            source=str(long_scene),
-            fps=5.0,
-            size=(320, 192),
-            method="M0",
-            detector="motion",
-            listen=(f"tcp/127.0.0.1:{free_port}",),
-            wait=0.0,
-            quiet=True,
-            metrics=address,
-        )
-    )
+    config = config_of(long_scene, free_port, metrics=address, method="M0", detector="motion", quiet=True)
     end = threading.Event()
     edge = Edge(config, stop=threading.Event(), world=HangingWorld(end))
     thread = threading.Thread(target=edge.run, daemon=True)
@@ -142,7 +133,6 @@ class SlowDetector(Detector):
     class_names = ("car",)
 
     def detect(self, image_bgr: Image) -> Detections:
-        """See there."""
         time.sleep(1.5)
         return detections([(50, 50, 90, 80)])
 
@@ -151,23 +141,12 @@ class SlowWorld(World):
     """With such a detector."""
 
     def open_detector(self, config: EdgeConfig) -> Detector:
-        """See there."""
         return SlowDetector()
 
 
 def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_port, capsys, long_scene):
     """Boxes of seconds ago would be taken for those of now, or none for a scene without objects."""
-    config = check(
-        EdgeConfig(
-            source=str(long_scene),
-            fps=5.0,
-            size=(320, 192),
-            method="M2",
-            listen=(f"tcp/127.0.0.1:{free_port}",),
-            wait=0.0,
-            metrics=address,
-        )
-    )
+    config = config_of(long_scene, free_port, metrics=address, method="M2")
     stop = threading.Event()
     thread = threading.Thread(target=Edge(config, stop=stop, world=SlowWorld()).run, daemon=True)
     thread.start()

@@ -30,7 +30,6 @@ CODEC = JpegCodec()
 
 
 def scene(width: int, height: int, *, seed: int = 0) -> np.ndarray:
-    """Texture at every scale, like ground seen from above."""
     rng = np.random.default_rng(seed)
     image = np.full((height, width, 3), 110, np.float32)
     for cell in (4, 12, 48):
@@ -40,28 +39,23 @@ def scene(width: int, height: int, *, seed: int = 0) -> np.ndarray:
 
 
 def request_for(box, *, index: int = 0) -> Request:
-    """A request for a still of one box."""
     one = candidate(4, box, frame_index=index)
     return Request(one, "utility", 1.0)
 
 
 def frame_of(source: np.ndarray, *, index: int = 0) -> Frame:
-    """A frame of which only the source matters."""
     return Frame(index=index, capture_ns=123, source_bgr=source, base_bgr=source)
 
 
 def mse(one: np.ndarray, other: np.ndarray) -> float:
-    """Mean squared error."""
     return float(np.mean((one.astype(np.float64) - other.astype(np.float64)) ** 2))
 
 
 def luma(image: np.ndarray) -> np.ndarray:
-    """BT.601 luma, not rounded."""
     return image @ np.array([0.114, 0.587, 0.299])
 
 
 def make(source, box, *, base=None, limit=100_000, maker=None, view=None, index=0):
-    """One still with the default settings."""
     shape = (source.shape[1], source.shape[0])
     view = view or View.fitted(shape, SIZE, fit="letterbox")
     maker = maker or StillMaker()
@@ -91,17 +85,18 @@ def test_crop_box_is_inside_and_holds_the_box(x, y, w, h, padding, size):
             assert end >= min(limit, high)
 
 
-def test_crop_box_known_answers():
+@pytest.mark.parametrize(
+    ("box", "padding", "crop"),
+    [
+        ((100, 200, 200, 240), 0.15, (85, 194, 215, 246)),
+        ((0, 0, 100, 40), 0.15, (0, 0, 115, 46)),
+        ((1900, 1070, 1930, 1090), 0.0, (1900, 1070, 1920, 1080)),
+        ((50, 50, 52, 52), 0.15, (47, 47, 55, 55)),
+    ],
+)
+def test_crop_box_known_answers(box, padding, crop):
     """The padding would not be the pilot's 15 % on each side."""
-    assert crop_box((100, 200, 200, 240), padding=0.15, source_size=(1920, 1080)) == (85, 194, 215, 246)
-    assert crop_box((0, 0, 100, 40), padding=0.15, source_size=(1920, 1080)) == (0, 0, 115, 46)
-    assert crop_box((1900, 1070, 1930, 1090), padding=0.0, source_size=(1920, 1080)) == (
-        1900,
-        1070,
-        1920,
-        1080,
-    )
-    assert crop_box((50, 50, 52, 52), padding=0.15, source_size=(1920, 1080)) == (47, 47, 55, 55)
+    assert crop_box(box, padding=padding, source_size=(1920, 1080)) == crop
 
 
 def test_a_still_says_what_it_shows():
@@ -111,13 +106,8 @@ def test_a_still_says_what_it_shows():
     assert isinstance(still, Still)
     shown = still.header
     assert (shown.sequence, shown.frame_index, shown.capture_ns, shown.track_id) == (9, 17, 123, 4)
-    assert still.header.crop_source_px == (285, 191, 415, 269)
-    assert (shown.class_name, shown.reason, shown.codec, shown.quality_pct) == (
-        "car",
-        "utility",
-        "jpeg",
-        65,
-    )
+    assert shown.crop_source_px == (285, 191, 415, 269)
+    assert (shown.class_name, shown.reason, shown.codec, shown.quality_pct) == ("car", "utility", "jpeg", 65)
     assert jpeg_size(still.data) == (130, 78)
     crop = source[191:269, 285:415]
     assert still.data == CODEC.encode(np.ascontiguousarray(crop), quality_pct=65).data
@@ -171,12 +161,7 @@ def test_quality_rises_until_the_base_is_beaten():
     """At a good base rate half of the stills would be worse than what the operator already sees."""
     source = scene(1280, 720)
     box = (300.0, 200.0, 420.0, 280.0)
-    base_pictures = {
-        quality: cv2.imdecode(
-            cv2.imencode(".jpg", source, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR
-        )
-        for quality in (30, 72, 84)
-    }
+    base_pictures = {quality: jpeg_coded(source, quality) for quality in (30, 72, 84)}
     made = {quality: make(source, box, base=base) for quality, base in base_pictures.items()}
     assert made[30].header.quality_pct == 65
     assert 72 < made[72].header.quality_pct < 84 < made[84].header.quality_pct <= 90
@@ -209,7 +194,6 @@ def test_the_base_gets_its_best_chance():
 
 
 def flown(data, *, kbps: int) -> tuple[list[np.ndarray], list[np.ndarray], View, int]:
-    """Source frames, what the ground decodes of them, the map between them, and the width of the border."""
     sources = real_pictures(data / "clips" / "drone_carpark.mp4", 24, size=(1100, 720), step=1)
     left = (SIZE[0] - 1100) // 2
     padded = [cv2.copyMakeBorder(one, 0, 0, left, left, cv2.BORDER_CONSTANT) for one in sources]
@@ -276,19 +260,15 @@ def test_every_still_is_closer_to_the_source_than_the_base(data, kbps, raised):
     assert any(still.header.quality_pct > 65 for still in stills) == raised
 
 
-# Codecs that build on the base, and fidelity
-
 CAR = (300.0, 200.0, 420.0, 280.0)
 BASE_CODED = StillMaker(codec=StandIn(), fallback=CODEC)
 
 
 def blurred(source: np.ndarray) -> np.ndarray:
-    """What a base of few bits shows: the shapes without their texture."""
     return cv2.GaussianBlur(source, (0, 0), 2)
 
 
 def shown_of(still: Still, *, base: np.ndarray | None = None, view: View | None = None) -> np.ndarray:
-    """What the ground sees: it has nothing but the still's header, its bytes and its own base frame."""
     x1, y1, x2, y2 = still.header.crop_source_px
     size = (int(still.header.parameters.get("w", x2 - x1)), int(still.header.parameters.get("h", y2 - y1)))
     if still.header.codec == "jpeg":
@@ -299,13 +279,16 @@ def shown_of(still: Still, *, base: np.ndarray | None = None, view: View | None 
 
 
 def crop_px(source: np.ndarray, still: Still) -> np.ndarray:
-    """The source's pixels of a still."""
     x1, y1, x2, y2 = still.header.crop_source_px
     return source[y1:y2, x1:x2]
 
 
+def jpeg_coded(source: np.ndarray, quality_pct: int) -> np.ndarray:
+    _, data = cv2.imencode(".jpg", source, [cv2.IMWRITE_JPEG_QUALITY, quality_pct])
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)
+
+
 def psnr_db(one: np.ndarray, other: np.ndarray) -> float:
-    """Luma PSNR."""
     return 10 * np.log10(255**2 / max(1e-9, mse(luma(one), luma(other))))
 
 
@@ -356,16 +339,16 @@ def test_without_a_base_frame_the_fallback_serves():
 @pytest.mark.parametrize("fidelity_db", [0.0, 36.0])
 def test_where_the_base_shows_something_else_the_fallback_is_smaller(fidelity_db):
     """An object that has just come into view would cost more bits than with no base at all."""
-    source = scene(*SIZE)
-    elsewhere = scene(*SIZE, seed=5)
-    maker = StillMaker(codec=StandIn(), fallback=CODEC, fidelity_db=fidelity_db)
-    chosen = make(source, CAR, base=elsewhere, maker=maker)
-    # What it would have been: no fallback ever beats a still of the same codec in size.
-    built = make(
-        source,
-        CAR,
-        base=elsewhere,
-        maker=StillMaker(codec=StandIn(), fallback=Hopeless(), fidelity_db=fidelity_db),
+    source, elsewhere = scene(*SIZE), scene(*SIZE, seed=5)
+    # The other is what it would have been: no fallback ever beats a still of the same codec in size.
+    chosen, built = (
+        make(
+            source,
+            CAR,
+            base=elsewhere,
+            maker=StillMaker(codec=StandIn(), fallback=fallback, fidelity_db=fidelity_db),
+        )
+        for fallback in (CODEC, Hopeless())
     )
     assert chosen.header.codec == "jpeg"
     assert len(chosen.data) < len(built.data)
@@ -409,9 +392,7 @@ def test_parameters_take_their_part_of_the_admission():
 def test_one_still_of_several_beats_the_base_at_each_of_them():
     """A neighbour that the base shows well would be shown worse by the still it shares."""
     source = scene(*SIZE)
-    base = cv2.imdecode(
-        cv2.imencode(".jpg", source, [cv2.IMWRITE_JPEG_QUALITY, 75])[1], cv2.IMREAD_COLOR
-    )  # better than a still of quality 65, but for one place
+    base = jpeg_coded(source, 75)  # better than a still of quality 65, but for one place
     base[200:280, 300:420] = blurred(source)[200:280, 300:420]
     lead = request_for(CAR)
     other = replace(request_for((440.0, 200.0, 560.0, 280.0)).candidate, track_id=7)

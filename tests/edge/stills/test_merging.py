@@ -16,6 +16,7 @@ from hvt_common.video.base_crop import coded_size
 from hvt_edge.perception.candidates import crop_box
 from hvt_edge.stills.policy.base import (
     ALSO_BYTES,
+    MOST_ALSO,
     STILL_OVERHEAD_BYTES,
     CostEstimate,
     Request,
@@ -32,7 +33,6 @@ COSTS = st.builds(CostEstimate, st.floats(0, 800), st.floats(0, 0.3), st.just(10
 
 
 def request_for(track_id: int, x: float, y: float, *, side: float = 20, score: float = 1.0) -> Request:
-    """A request for a still of a square object."""
     box = (x, y, x + side, y + side)
     size = coded_size(crop_box(box, padding=PADDING, source_size=SOURCE))
     one = candidate(track_id, box, frame_index=7, confidence=0.5, crop_area_px=float(size[0] * size[1]))
@@ -41,7 +41,6 @@ def request_for(track_id: int, x: float, y: float, *, side: float = 20, score: f
 
 @st.composite
 def requests_of(draw) -> list[Request]:
-    """A crowd, most wanted first."""
     places = draw(
         st.lists(
             st.tuples(st.floats(0, 1200), st.floats(0, 640), st.floats(2, 700), st.floats(0, 9)), max_size=30
@@ -54,74 +53,61 @@ def requests_of(draw) -> list[Request]:
     return sorted(some, key=lambda one: (-one.score, one.candidate.track_id))
 
 
-def joined(some: list[Request], **changes) -> list[tuple[Request, list[Request]]]:
-    """Grouped as in flight."""
-    settings = {
-        "cost": CostEstimate(300, 0.1, 1000),
-        "overhead_bytes": STILL_OVERHEAD_BYTES,
-        "padding": PADDING,
-        "source_size": SOURCE,
-    }
-    return group(some, **{**settings, **changes})
+def joined(some: list[Request], **changes) -> list[Request]:
+    plain = {"cost": CostEstimate(300, 0.1, 1000), "overhead_bytes": STILL_OVERHEAD_BYTES}
+    return group(some, **{**plain, **changes}, padding=PADDING, source_size=SOURCE)
 
 
 def line_bytes(one: Request, cost: CostEstimate, overhead: float) -> float:
-    """What its still is expected to take."""
     payload = expected_bytes(one, cost=cost, padding=PADDING, source_size=SOURCE)
     return payload + overhead + ALSO_BYTES * len(one.also)
 
 
 @settings(max_examples=150, deadline=None)
-@given(some=requests_of(), cost=COSTS, overhead=st.floats(0, 300), most=st.integers(0, 15))
-def test_sharing_never_costs_more_and_loses_nobody(some, cost, overhead, most):
+@given(some=requests_of(), cost=COSTS, overhead=st.floats(0, 300))
+def test_sharing_never_costs_more_and_loses_nobody(some, cost, overhead):
     """Sharing would waste what it is there to save, or an object would never get its still."""
-    groups = joined(some, cost=cost, overhead_bytes=overhead, most=most)
-    assert joined(some, cost=cost, overhead_bytes=overhead, most=most) == groups
-    ids = [request.candidate.track_id for lead, others in groups for request in (lead, *others)]
-    assert sorted(ids) == sorted(one.candidate.track_id for one in some)
+    groups = joined(some, cost=cost, overhead_bytes=overhead)
+    assert joined(some, cost=cost, overhead_bytes=overhead) == groups
+    tracks = [(lead.candidate.track_id, *(one.track_id for one in lead.also)) for lead in groups]
+    assert sorted(one for shown in tracks for one in shown) == sorted(one.candidate.track_id for one in some)
     by_id = {one.candidate.track_id: one for one in some}
-    for lead, others in groups:
-        alone = [by_id[one.candidate.track_id] for one in (lead, *others)]
-        assert (
-            line_bytes(lead, cost, overhead) <= sum(line_bytes(one, cost, overhead) for one in alone) + 1e-6
-        )
-        assert [one.track_id for one in lead.also] == sorted(one.candidate.track_id for one in others)
-        assert len(others) <= most
+    for lead, shown in zip(groups, tracks, strict=True):
+        alone = [by_id[one] for one in shown]
+        singly = sum(line_bytes(one, cost, overhead) for one in alone)
+        assert line_bytes(lead, cost, overhead) <= singly + 1e-6
+        assert shown[1:] == tuple(sorted(shown[1:]))
+        assert len(lead.also) <= MOST_ALSO
         assert lead.score >= max(one.score for one in alone)
-        if others:
+        if lead.also:
             x1, y1, x2, y2 = union_crop(lead, padding=PADDING, source_size=SOURCE)
             assert max(x2 - x1, y2 - y1) <= 512
         else:
             assert lead == alone[0]
-    scores = [lead.score for lead, _ in groups]
+    scores = [lead.score for lead in groups]
     assert scores == sorted(scores, reverse=True)
 
 
 def test_a_car_park_row_shares_and_the_far_one_does_not():
     """Four headers would be paid for four objects that one small crop shows."""
     row = [request_for(number, 100 + 24 * number, 200, score=5 - number) for number in range(1, 5)]
-    far = request_for(9, 900, 600, score=0.5)
-    (first, others), (second, alone) = joined([*row, far])
+    far, cost = request_for(9, 900, 600, score=0.5), CostEstimate(300, 0.1, 1000)
+    first, second = joined([*row, far])
     assert first.candidate.track_id == 1
-    assert [one.candidate.track_id for one in others] == [2, 3, 4]
+    assert [one.track_id for one in first.also] == [2, 3, 4]
     assert union_crop(first, padding=PADDING, source_size=SOURCE) == (121, 197, 219, 223)
-    assert (second, alone) == (far, [])
-    single = sum(
-        one.score * line_bytes(one, CostEstimate(300, 0.1, 1000), STILL_OVERHEAD_BYTES) for one in row
-    )
+    assert second == far
+    single = sum(one.score * line_bytes(one, cost, STILL_OVERHEAD_BYTES) for one in row)
     assert first.score == pytest.approx(single / (300 + 0.1 * 98 * 26 + STILL_OVERHEAD_BYTES + 3 * 17))
+    many = [request_for(number, 100 + 9 * number, 200, side=8) for number in range(1, 31)]
+    assert max(len(one.also) for one in joined(many, cost=CostEstimate(300, 0, 1000))) == MOST_ALSO
 
 
-def test_pixels_between_have_their_price():
+@pytest.mark.parametrize(("apart", "cost_per_px", "stills"), [(100, 0.01, 1), (100, 0.3, 2), (600, 0.0, 2)])
+def test_pixels_between_have_their_price(apart, cost_per_px, stills):
     """Two objects at the two ends of the picture would make one huge still."""
-    near, pricey = CostEstimate(300, 0.01, 1000), CostEstimate(300, 0.3, 1000)
-    pair = [request_for(1, 100, 200), request_for(2, 200, 200)]
-    assert len(joined(pair, cost=near)) == 1
-    assert len(joined(pair, cost=pricey)) == 2
-    assert (
-        len(joined([request_for(1, 100, 200), request_for(2, 700, 200)], cost=CostEstimate(300, 0, 1000)))
-        == 2
-    )
+    pair = [request_for(1, 100, 200), request_for(2, 100 + apart, 200)]
+    assert len(joined(pair, cost=CostEstimate(300, cost_per_px, 1000))) == stills
     assert joined([]) == []
 
 
@@ -141,10 +127,6 @@ def test_the_overhead_that_is_reckoned_with_is_the_real_one():
 
 def test_a_crowd_takes_bounded_time():
     """A thousand tracks would stop the pictures."""
-    rng = np.random.default_rng(3)
-    crowd = [
-        request_for(n, float(rng.uniform(0, 1200)), float(rng.uniform(0, 640)), side=8)
-        for n in range(1, 1001)
-    ]
-    groups = joined(crowd)
-    assert sum(1 + len(others) for _, others in groups) == 1000
+    places = np.random.default_rng(3).uniform((0, 0), (1200, 640), (1000, 2)).tolist()
+    crowd = [request_for(number, x, y, side=8) for number, (x, y) in enumerate(places, 1)]
+    assert sum(1 + len(lead.also) for lead in joined(crowd)) == 1000

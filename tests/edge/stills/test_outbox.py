@@ -19,35 +19,29 @@ from hvt_edge.stills.policy.base import Request
 from rigs.messages import still_of
 
 MS, S = 1_000_000, 1_000_000_000
-RTT = 80 * MS
 BOX = (0.0, 0.0, 10.0, 10.0)
 
 
 def crop(track: int = 1, *also: int, side: int = 10) -> Still:
-    """A crop of ``3 * side * side`` bytes."""
     shown = tuple(AlsoShown(track_id=one, box_source_px=BOX) for one in also)
     crop_bgr = np.zeros((side, side, 3), np.uint8)
     return replace(still_of(track_id=track, also=shown), crop_bgr=crop_bgr)
 
 
 def request_of(track: int, score: float, *also: int) -> Request:
-    """Of one candidate, or of several."""
     lead, *others = (Candidate(0, one, BOX, BOX, 0, "car", 0.5, 0.1, 100.0, 0) for one in (track, *also))
     return Request(lead, "test", score, tuple(others))
 
 
 def pending(track: int, utility: float, *also: int, since_ns: int = 0) -> OutboxStill:
-    """One that waits."""
     return OutboxStill(crop(track, *also), request_of(track, utility, *also), utility, since_ns)
 
 
 def tracks(outbox: Outbox) -> list[int]:
-    """Ids of the tracks that lead, in order."""
     return sorted(one.track_id for one in outbox.pending)
 
 
 def sent(outbox: Outbox, sequence: int, *, at_ns: int = 0, size: int = 400, resend: int = 0) -> OutboxStill:
-    """One that goes out, of a track and a utility of its own; ``resend``: the side of its crop."""
     one = pending(100 + sequence, float(sequence), since_ns=at_ns)
     job = crop(100 + sequence, side=resend) if resend else None
     still = still_of(bytes(size), track_id=one.track_id, sequence=sequence)
@@ -56,7 +50,6 @@ def sent(outbox: Outbox, sequence: int, *, at_ns: int = 0, size: int = 400, rese
 
 
 def flown(count: int = 4) -> Outbox:
-    """So many sent, 100 ms apart; the utility of a still is its number."""
     outbox = Outbox()
     for sequence in range(count):
         sent(outbox, sequence, at_ns=sequence * 100 * MS)
@@ -64,30 +57,19 @@ def flown(count: int = 4) -> Outbox:
 
 
 def overdue(outbox: Outbox, at_s: float) -> list[int]:
-    """The sequences that are to be sent again."""
     return [one.still.header.sequence for one in outbox.overdue(round(at_s * S))]
 
 
 def lost(outbox: Outbox) -> list[int]:
-    """What an outage takes, by sequence."""
     return [one.still.header.sequence for one in outbox.lose()]
-
-
-# Pending
 
 
 def test_the_most_useful_comes_first_and_ties_go_to_the_older():
     """The budget would go to lesser stills, or to others in each run."""
-    outbox = Outbox()
+    outbox, order = Outbox(), []
     assert outbox.best() is None
-    for one in (
-        pending(3, 0.5, since_ns=2),
-        pending(2, 0.9, since_ns=2),
-        pending(1, 0.9, since_ns=1),
-        pending(0, 0.9, since_ns=2),
-    ):
-        assert outbox.offer(one) == []
-    order = []
+    for track, utility, since_ns in ((3, 0.5, 2), (2, 0.9, 2), (1, 0.9, 1), (0, 0.9, 2)):
+        assert outbox.offer(pending(track, utility, since_ns=since_ns)) == []
     while (best := outbox.best()) is not None:
         order.append(best.track_id)
         outbox.give_up(best)
@@ -95,38 +77,20 @@ def test_the_most_useful_comes_first_and_ties_go_to_the_older():
     assert order == [1, 0, 2, 3]
 
 
-def test_a_newer_still_of_a_track_takes_the_place_of_the_older():
-    """The operator would get the object as it was, and then once more as it is."""
-    outbox = Outbox()
-    first, second = pending(1, 0.9), pending(1, 0.1, since_ns=5)
+def test_a_newer_still_the_least_useful_and_what_waits_too_long_make_room():
+    """An object would be sent as it was, and then as it is; or one busy frame push out the best still."""
+    outbox = Outbox(OutboxSettings(max_pending=2, max_pending_ns=10))
+    first, second, least = pending(1, 0.9), pending(1, 0.1, since_ns=5), pending(3, 0.05, since_ns=5)
     outbox.offer(first)
     assert outbox.offer(second) == [(first, "replaced")]
-    assert outbox.pending == (second,)
-    assert (first.state, second.state) == (StillState.EXPIRED, StillState.PENDING)
-
-
-def test_the_least_useful_leaves_a_full_outbox():
-    """One busy frame would push the best still out, or fill the memory with source frames."""
-    outbox = Outbox(OutboxSettings(max_pending=2))
-    outbox.offer(pending(1, 0.5))
-    outbox.offer(pending(2, 0.2))
-    least = pending(3, 0.1)
+    assert (outbox.pending, first.state, second.state) == ((second,), StillState.EXPIRED, StillState.PENDING)
+    assert outbox.offer(pending(2, 0.2)) == []
     assert outbox.offer(least) == [(least, "queue_full")]
-    (left,) = outbox.offer(pending(4, 0.9))
-    assert left[0].track_id == 2
-    assert tracks(outbox) == [1, 4]
-
-
-def test_what_was_pending_for_too_long_leaves():
-    """A still of a past that nobody looks at any more would cost its bits."""
-    outbox = Outbox(OutboxSettings(max_pending_ns=10))
-    old, young = pending(1, 0.9, since_ns=0), pending(2, 0.1, since_ns=5)
-    outbox.offer(old)
-    outbox.offer(young)
+    ((left, _),) = outbox.offer(pending(4, 0.9, since_ns=4))
+    assert (left.track_id, tracks(outbox)) == (1, [2, 4])
     assert outbox.expire(10) == []
-    assert outbox.expire(11) == [(old, "stale")]
-    assert tracks(outbox) == [2]
-    assert outbox.clear() == [(young, "ended")]
+    assert [(one.track_id, why) for one, why in outbox.expire(11)] == [(2, "stale")]
+    assert [(one.track_id, why) for one, why in outbox.clear()] == [(4, "ended")]
     assert len(outbox) == 0
 
 
@@ -199,11 +163,9 @@ def test_every_pending_still_leaves_exactly_once(offers, length, age):
     assert {one.state for one in left} <= {StillState.EXPIRED}
 
 
-# Sent, and what reports say of it
-
-
-def test_what_a_report_names_is_acknowledged_and_what_is_missing_is_not():
+def test_what_a_report_names_is_acknowledged_and_an_outage_takes_the_rest_the_most_useful_first():
     """After an outage the edge would store what the ground has, or lose what it has not."""
+    assert lost(flown()) == [3, 2, 1, 0]
     outbox = flown()
     assert outbox.on_report(3, (1,), now_ns=S)
     assert not outbox.on_report(3, (1,), now_ns=S), "it is no news"
@@ -213,11 +175,6 @@ def test_what_a_report_names_is_acknowledged_and_what_is_missing_is_not():
     assert (outbox.unacknowledged, outbox.sent_bytes, lost(outbox)) == (0, 0, [])
     outbox.stored(one, one.still)
     assert one.state is StillState.STORED
-
-
-def test_an_outage_takes_the_most_useful_first():
-    """The store would keep the least useful."""
-    assert lost(flown()) == [3, 2, 1, 0]
 
 
 def test_numbers_of_stored_stills_leave_no_hole_in_those_that_are_sent():
@@ -247,25 +204,23 @@ def test_in_lockstep_no_report_decides_anything():
     assert (outbox.unacknowledged, outbox.overdue(2 * S), outbox.lose()) == (0, [], [])
 
 
-# What is sent again
-
-
-def test_a_still_is_overdue_when_a_report_ought_to_have_named_it():
+@pytest.mark.parametrize(
+    ("report", "overdue_at"),
+    [
+        ((1, (0,), 1.25, 0.08), {1.25: [2, 0], 2.0: [2, 0]}),  # 3 was sent too shortly before the last report
+        ((1, (0,), 1.25, 0.4), {1.25: [0]}),
+        ((1, (0,), 1.25, 0.42), {1.25: []}),
+        (None, {3.0: []}),  # into an outage, or to a receiver that never reports, each would be sent twice
+        ((-1, (), 0.3, 0.08), {3.0: []}),
+    ],
+)
+def test_a_still_is_overdue_when_a_report_ought_to_have_named_it(report, overdue_at):
     """Stills would be sent twice while they are on their way, or not at all; the most useful first."""
-    for round_trip_ns, expected in ((RTT, [2, 0]), (400 * MS, [0]), (420 * MS, [])):
-        outbox = flown()
-        outbox.on_report(1, (0,), now_ns=1_250 * MS, round_trip_ns=round_trip_ns)
-        assert overdue(outbox, 1.25) == expected
-        if round_trip_ns == RTT:
-            assert overdue(outbox, 2.0) == [2, 0], "3 was sent too shortly before the last report"
-
-
-def test_in_silence_nothing_is_overdue():
-    """Into an outage, or to a receiver that never reports, every still would be sent twice."""
     outbox = flown()
-    assert overdue(outbox, 3.0) == []
-    outbox.on_report(-1, (), now_ns=300 * MS)
-    assert overdue(outbox, 3.0) == []
+    if report is not None:
+        named, missing, at_s, round_trip_s = report
+        outbox.on_report(named, missing, now_ns=round(at_s * S), round_trip_ns=round(round_trip_s * S))
+    assert {at_s: overdue(outbox, at_s) for at_s in overdue_at} == overdue_at
 
 
 def test_each_is_sent_again_once_and_only_while_it_is_young():
@@ -277,35 +232,26 @@ def test_each_is_sent_again_once_and_only_while_it_is_young():
     outbox.sent_again(outbox.overdue(3_900 * MS)[1])
     assert overdue(outbox, 4.1) == [3, 1]
     assert overdue(outbox, 4.5) == []
-    assert lost(outbox) == [3, 2, 1, 0], "what never arrived can still be stored"
-
-
-def test_a_second_copy_of_what_has_arrived_meanwhile_is_not_kept():
-    """It would be stored, and shown once more, after the next outage."""
-    outbox = flown()
-    outbox.on_report(-1, (), now_ns=2 * S)
-    again = outbox.overdue(2 * S)
-    outbox.on_report(3, (), now_ns=2 * S)
-    outbox.sent_again(again[0])
-    assert lost(outbox) == []
-
-
-# What the ground cannot decode
+    again = outbox.overdue(3_900 * MS)[2]
+    outbox.on_report(2, (), now_ns=4_500 * MS)
+    outbox.sent_again(again)
+    assert lost(outbox) == [3], "what never arrived can still be stored, and what has come meanwhile is not"
 
 
 @pytest.mark.parametrize("reported", [True, False], ids=["acknowledged", "unnamed"])
 def test_what_the_ground_cannot_decode_is_pending_once_more_and_only_once(reported):
     """Stills would be sent twice, or none at all."""
     outbox = Outbox()
-    for sequence in (3, 4):
-        sent(outbox, sequence, resend=10)
+    one, _ = (sent(outbox, sequence, resend=10) for sequence in (3, 4))
+    one.job = one.crop.with_header(parameters={"utility": 0.5})
     if reported:
         outbox.on_report(4, (), now_ns=1)
     for sequence in (4, 3, 4, 99, -1):
         outbox.on_undecodable(sequence)
     assert outbox.offer_undecodable(1) == []
     headers = [one.crop.header for one in outbox.pending]
-    assert [(one.reason, one.parameters) for one in headers] == [(AGAIN, {AGAIN: 3}), (AGAIN, {AGAIN: 4})]
+    assert [one.reason for one in headers] == [AGAIN, AGAIN]
+    assert [one.parameters for one in headers] == [{"utility": 0.5, AGAIN: 3}, {AGAIN: 4}], "the method's too"
     assert all(one.again for one in outbox.pending)
     outbox.clear()
     for sequence in (3, 4):
@@ -316,37 +262,17 @@ def test_what_the_ground_cannot_decode_is_pending_once_more_and_only_once(report
     assert outbox.unacknowledged == (0 if reported else 2)
 
 
-def test_a_still_that_is_coded_again_keeps_the_parameters_of_its_method():
-    """The ground would not know any more by what the method chose it."""
+def test_a_crop_that_is_too_old_or_that_a_newer_one_follows_is_not_coded_again():
+    """The operator would get an object as it was long ago, while its present picture waits."""
     outbox = Outbox()
-    one = sent(outbox, 3, resend=10)
-    assert one.job is not None
-    one.job = one.job.with_header(parameters={"utility": 0.5})
-    outbox.on_undecodable(3)
-    outbox.offer_undecodable(1)
-    assert [again.crop.header.parameters for again in outbox.pending] == [{"utility": 0.5, AGAIN: 3}]
-
-
-def test_a_newer_still_of_the_track_makes_it_needless():
-    """Bits would go to the object as it was, while its present picture waits."""
-    outbox = Outbox()
-    sent(outbox, 0, resend=10)
-    outbox.offer(pending(100, 0.5))
-    outbox.on_undecodable(0)
-    assert outbox.offer_undecodable(1) == []
-    assert not any(one.again for one in outbox.pending)
-
-
-def test_a_crop_that_is_too_old_is_forgotten():
-    """The operator would get an object as it was long ago."""
-    outbox = Outbox()
-    old, young = sent(outbox, 0, resend=10), sent(outbox, 1, at_ns=S, resend=10)
-    outbox.on_report(1, (), now_ns=S)
-    outbox.on_undecodable(0)
-    outbox.on_undecodable(1)
+    old, young, followed = (sent(outbox, n, at_ns=min(n, 1) * S, resend=10) for n in range(3))
+    outbox.on_report(2, (), now_ns=S)
+    outbox.offer(pending(102, 0.5))
+    for sequence in range(3):
+        outbox.on_undecodable(sequence)
     outbox.offer_undecodable(5 * S)
-    assert tracks(outbox) == [101]
-    assert (old.state, young.state) == (StillState.EXPIRED, StillState.EXPIRED)
+    assert [(one.track_id, one.again) for one in outbox.pending] == [(102, False), (101, True)]
+    assert {old.state, young.state, followed.state} == {StillState.EXPIRED}
 
 
 @given(
@@ -376,11 +302,6 @@ def test_whatever_grounds_request_the_memory_is_bounded(stills, count, size_byte
 def test_stills_thread_and_link_may_act_at_once():
     """The edge would crash in flight, once in a thousand."""
     outbox = Outbox(OutboxSettings(max_sent=8))
-
-    def run(work) -> None:
-        for index in range(800):
-            work(index)
-
     works = (
         lambda index: sent(outbox, index, at_ns=index * MS, size=10, resend=4),
         lambda index: outbox.on_report(index - 5, (), now_ns=index * MS),
@@ -392,6 +313,6 @@ def test_stills_thread_and_link_may_act_at_once():
         lambda index: outbox.expire_on_demand(index * S),
     )
     with ThreadPoolExecutor(len(works)) as threads:
-        list(threads.map(run, works))
+        list(threads.map(lambda work: [work(index) for index in range(800)], works))
     outbox.lose()
     assert outbox.sent_bytes == 0

@@ -20,7 +20,7 @@ from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
-from hvt_edge.stills.policy.base import CostModel, Request, Step
+from hvt_edge.stills.policy.base import CostModel, Request, Step, ranked
 from hvt_edge.stills.scheduler import Chooser, Gate, Suppression
 from media.base_coded import StandIn
 from media.clips import START_NS, hard_pictures
@@ -42,12 +42,10 @@ class ByScore:
     video_only: bool = False
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
-        """All of them."""
-        given_scores = dict(self.scores)
-        wanted = [
-            Request(one, "test", given_scores.get(one.track_id, float(one.track_id))) for one in candidates
-        ]
-        return sorted(wanted, key=lambda request: -request.score)
+        scores = dict(self.scores)
+        return ranked(
+            candidates, score=lambda one: scores.get(one.track_id, float(one.track_id)), reason="test"
+        )
 
 
 class Rig:
@@ -92,11 +90,9 @@ class Rig:
 
     @property
     def now_ns(self) -> int:
-        """Time of the step."""
         return START_NS + self.number * STEP_NS
 
     def consider(self, boxes: dict[int, tuple[float, ...]], *, base=FLAT, detected: bool = True) -> None:
-        """The next decision step."""
         self.number += 1
         tracks = tracks_of(self.number, boxes)
         seen = AnalyzedFrame(
@@ -105,7 +101,6 @@ class Rig:
         self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
 
     def coded(self, allowance: int) -> list[OutboxStill]:
-        """Send what fits ``allowance`` in all."""
         coded, left = [], [allowance]
         for one in self.chooser.stills(now_ns=self.now_ns, allowance=lambda _still: left[-1]):
             assert len(one.still.data) <= left[-1]
@@ -116,7 +111,6 @@ class Rig:
         return coded
 
     def stills(self, allowance: int) -> list[int]:
-        """Send what fits ``allowance`` in all; the tracks of the stills."""
         return [one.track_id for one in self.coded(allowance)]
 
 
@@ -124,27 +118,23 @@ SMALL, LARGE = (20.0, 20.0, 60.0, 50.0), (150.0, 50.0, 500.0, 330.0)
 
 
 def box_at(number: int, side: float = 36.0) -> tuple[float, ...]:
-    """One of many small boxes."""
     x, y = 10.0 + 45 * (number % 12), 10.0 + 45 * (number // 12)
     return x, y, x + side, y + side
 
 
 def test_the_most_useful_is_sent_first_as_long_as_there_is_room():
-    """The bits would go to whatever was seen first."""
+    """The bits would go to whatever was seen first, or starve what matters behind what happens to be small."""
     rig = Rig()
     rig.consider({1: box_at(1), 3: box_at(3), 2: box_at(2)})
     assert rig.stills(100_000) == [3, 2, 1]
     assert rig.outcomes == {("sent", "test"): 3}
     assert len(rig.outbox) == 0
-
-
-def test_a_lesser_one_does_not_slip_in_before_the_most_useful():
-    """What matters would starve behind what happens to be small."""
     rig = Rig(ByScore(((1, 1.0), (2, 2.0))))
     rig.consider({1: SMALL, 2: LARGE})
     assert rig.stills(2_500) == []
     assert len(rig.outbox) == 2
-    assert rig.stills(60_000) == [2, 1]
+    rig.consider({1: SMALL, 2: LARGE, 3: box_at(5)}, detected=False)
+    assert rig.stills(60_000) == [2, 1], "between detections nothing is requested, but what is pending may go"
 
 
 def test_one_that_never_fits_does_not_block_the_others_for_ever():
@@ -181,15 +171,6 @@ def test_what_the_base_shows_as_well_is_not_sent():
     assert rig.outcomes["deferred", "refused"] == 1, "it rests before it is tried again"
 
 
-def test_between_detections_nothing_is_requested_but_what_is_pending_may_go():
-    """Stills would wait for the next detection although there is room now."""
-    rig = Rig()
-    rig.consider({1: SMALL})
-    assert rig.stills(10) == []
-    rig.consider({1: SMALL, 2: box_at(5)}, detected=False)
-    assert rig.stills(100_000) == [1]
-
-
 def test_sequence_numbers_count_stills_and_nothing_else():
     """The ground would believe that stills were lost."""
     rig = Rig()
@@ -202,8 +183,6 @@ def test_sequence_numbers_count_stills_and_nothing_else():
     assert len(numbers) >= 4
 
 
-# Neighbours, the gate, and stills that build on the base
-
 NEIGHBOURS = {1: (20.0, 20.0, 44.0, 40.0), 2: (46.0, 22.0, 70.0, 42.0), 3: (400.0, 200.0, 440.0, 240.0)}
 BASE_CODED = StillMaker(codec=StandIn(), fallback=JpegCodec())
 BLURRED = cv2.GaussianBlur(PICTURE, (0, 0), 3)
@@ -214,7 +193,7 @@ def test_neighbours_share_a_still_and_all_of_them_count_as_sent():
     rig = Rig(share=True, cooldown=5.0)
     rig.consider(NEIGHBOURS)
     assert rig.stills(100_000) == [3, 2]
-    alone, pair = (one.header for one in rig.sent)
+    (alone, pair), shared_bytes = (one.header for one in rig.sent), len(rig.sent[1].data)
     assert (alone.also, [one.track_id for one in pair.also]) == ((), [1])
     assert pair.crop_source_px == (16, 17, 74, 45)
     assert rig.outcomes == {("sent", "test"): 2}, "one for each still"
@@ -222,25 +201,13 @@ def test_neighbours_share_a_still_and_all_of_them_count_as_sent():
     assert [one.sent_count for one in rig.steps[-1][0]] == [1, 1, 1]
     assert rig.stills(100_000) == []
     assert rig.outcomes["deferred", "cooldown"] == 3
-
-
-def test_without_the_setting_each_has_its_own():
-    """The paper's methods would send other stills than the paper says."""
-    rig = Rig()
-    rig.consider(NEIGHBOURS)
-    assert rig.stills(100_000) == [3, 2, 1]
-
-
-def test_the_cost_of_a_shared_still_is_learnt_by_what_it_codes():
-    """The method would believe that stills are larger than they are, and wait for room that it does not need."""
-    rig = Rig(share=True)
-    rig.consider({1: NEIGHBOURS[1], 2: NEIGHBOURS[2]})
-    assert rig.stills(100_000) == [2]
-    area, size = 58 * 28, len(rig.sent[0].data)
+    plain = Rig()
+    plain.consider(NEIGHBOURS)
+    assert plain.stills(100_000) == [3, 2, 1], "the paper's methods send what the paper says"
     learnt = CostModel.of_codec("jpeg")
-    learnt.observe(area_px=area, size_bytes=size)
-    rig.consider({})
-    assert rig.steps[-1][1].cost == learnt.estimate()
+    for area_px, size_bytes in ((52 * 52, len(rig.sent[0].data)), (58 * 28, shared_bytes)):
+        learnt.observe(area_px=area_px, size_bytes=size_bytes)
+    assert rig.steps[-1][1].cost == learnt.estimate(), "the cost is learnt by what a still codes"
 
 
 def test_the_gate_holds_back_what_the_base_shows_well_before_the_method_chooses():
@@ -270,19 +237,12 @@ def test_stills_that_build_on_the_base_wait_for_a_frame_that_has_one():
     assert (rig.sent[0].header.codec, rig.sent[0].header.frame_index) == ("stand-in", 1)
     rig.consider({1: SMALL}, base=BLURRED, detected=False)
     assert rig.stills(100_000) == [], "one step, one decision"
-    plain = Rig()
+    plain = Rig(cooldown=60.0)
     plain.consider({1: SMALL}, base=None)
     assert plain.stills(100_000) == [1], "what needs no base waits for none"
-
-
-def test_stills_of_other_codecs_are_never_sent_again():
-    """A forged request would double what a ground already has."""
-    rig = Rig(cooldown=60.0)
-    rig.consider({1: SMALL})
-    assert rig.stills(100_000) == [1]
-    rig.outbox.on_undecodable(0)
-    rig.consider({1: SMALL})
-    assert rig.stills(100_000) == []
+    plain.outbox.on_undecodable(0)
+    plain.consider({1: SMALL})
+    assert plain.stills(100_000) == [], "and a forged request does not double what a ground has"
 
 
 @settings(max_examples=25, deadline=None)
@@ -307,14 +267,10 @@ def test_every_candidate_of_a_step_has_exactly_one_outcome(steps, cooldown, gate
     assert sum(rig.outcomes.values()) == candidates
 
 
-# What the link has lost
-
-
 class LossRig(Rig):
     """A chooser with stills that were sent two seconds ago, and that a report ought to have named."""
 
     def lose(self, *losses: tuple[int, float, int]) -> None:
-        """So many stills of (track, utility, bytes)."""
         self.number = 0
         for track, utility, size in losses:
             still = still_of(bytes(size), sequence=self.outbox.sequence(store=False), track_id=track)
@@ -324,7 +280,6 @@ class LossRig(Rig):
         self.number = -1
 
     def sent_tracks(self, allowance: int = 100_000) -> list[tuple[int, float]]:
-        """(track, utility) of each that goes out."""
         return [(one.track_id, one.utility) for one in self.coded(allowance)]
 
 
@@ -346,15 +301,11 @@ def test_a_lost_still_that_is_not_allowed_holds_up_nobody():
     rig.consider({1: SMALL})
     assert rig.sent_tracks(8_999) == [(1, 1.0)]
     assert rig.sent_tracks(9_000) == [(50, 9.0)]
-
-
-def test_a_lost_still_leaves_precedence_to_a_newer_of_its_track():
-    """The operator would see the past of a car in place of its present."""
     rig = LossRig()
     rig.lose((3, 9.0, 400))
     rig.consider({3: SMALL})
     assert rig.sent_tracks(10) == []
-    assert rig.sent_tracks()[0] == (3, 3.0)
+    assert rig.sent_tracks()[0] == (3, 3.0), "a newer still of its track shows the present, not the past"
 
 
 def test_what_is_allowed_next_to_nothing_waits_for_an_allowance_that_helps():

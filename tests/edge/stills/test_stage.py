@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import replace
 
 import cv2
@@ -23,7 +23,7 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import JpegCodec, StillCodec
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.rate_control import RateController
 from hvt_edge.operating import Keyframes
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.frame_ring import FrameRing
@@ -51,7 +51,6 @@ UNITS = [_ENCODER.encode(frame) for frame in FRAMES]
 
 
 def make_analyzer(candidates: str = "decoded", *, detector=None, every: int = 5) -> Analyzer:
-    """With the real decoder and tracker."""
     return Analyzer(
         detector or RedSquares(),
         ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
@@ -89,32 +88,38 @@ class Rig:
         self.keyframes.done(FRAMES[0].capture_ns)
 
     def report(self, seen, *, now_ns) -> None:
-        """Report the tracks, as the edge's reporter does."""
         self.sender.metadata(Channel.TRACKS, lambda _at_ns: bytes([seen.frame.index]), now_ns=now_ns)
 
     def run(self, count: int = 30, *, start: int = 0) -> None:
-        """Frame after frame, as the lockstep loop does."""
         for frame, unit in list(zip(FRAMES, UNITS, strict=True))[start:count]:
             seen = self.stage.analyze(frame, unit)
             self.stage.step(seen, now_ns=frame.capture_ns)
 
 
+def worker_of(
+    rig: Rig, *, finish_s: float = PATIENT_S, clock=lambda: FRAMES[0].capture_ns, **more
+) -> StillWorker:
+    parts = {"failures": Failures(time.time_ns), **more}
+    return StillWorker(rig.stage, results=list, clock=clock, finish_s=finish_s, **parts)
+
+
 def decoded_bases() -> list[YuvPicture]:
-    """The base as the ground has it."""
     decoder = BaseDecoder()
     return [decoder.decode_yuv(unit.data) for unit in UNITS]
 
 
-def answer(sequence: int, *, again: bool) -> StillResult:
-    """What a ground says of a still that it could not show."""
-    return replace(RESULT, still_sequence=sequence, class_name="", again=again)
+def answer(sequence: int, *, again: bool = True, class_name: str = "", track_id: int = 1) -> StillResult:
+    return replace(RESULT, still_sequence=sequence, class_name=class_name, track_id=track_id, again=again)
 
 
 def test_what_the_edge_builds_on_is_what_the_ground_decodes():
     """No still would ever fit the ground's pictures."""
     rig, bases = Rig(), decoded_bases()
     rig.run()
-    assert [header.frame_index for header, _ in rig.out.stills] == [0, 15]
+    assert [(header.sequence, header.frame_index) for header, _ in rig.out.stills] == [(0, 0), (1, 15)]
+    assert rig.sender.ledger.outcomes("sent") == {"due": 2}
+    assert rig.stage.analyzer.tracks == 1
+    assert rig.stage.analyzer.mean_ms > 0
     for header, data in rig.out.stills:
         crop = header.crop_source_px
         size = (crop[2] - crop[0], crop[3] - crop[1])
@@ -129,14 +134,14 @@ def test_a_still_that_the_ground_cannot_show_is_sent_again_from_the_same_frame()
     """A lost picture of the base would cost the stills on it as well."""
     rig = Rig()
     rig.run(4)
-    rig.stage.on_results([answer(0, again=True), answer(0, again=True), answer(4_000_000, again=True)])
+    rig.stage.on_results([answer(0), answer(0), answer(4_000_000)])
     rig.run(8, start=4)
     (first, _), (second, data) = rig.out.stills
     assert (first.codec, second.codec, second.reason) == ("stand-in", "jpeg", "again")
     assert (second.sequence, second.frame_index, second.parameters) == (1, 0, {"again": 0})
     crop = second.crop_source_px
     assert JpegCodec().decode(data, size=(crop[2] - crop[0], crop[3] - crop[1])) is not None
-    rig.stage.on_results([answer(0, again=True), answer(1, again=True)])
+    rig.stage.on_results([answer(0), answer(1)])
     rig.run(12, start=8)
     assert len(rig.out.stills) == 2
 
@@ -184,13 +189,7 @@ def test_frames_that_wait_are_bounded_in_bytes(coded_as_it_is):
     frames = [replace(one, source_bgr=one.base_bgr) for one in FRAMES] if coded_as_it_is else FRAMES
     frame_bytes = FRAMES[0].base_bgr.nbytes + (0 if coded_as_it_is else FRAMES[0].source_bgr.nbytes)
     rig = Rig(analyzer=make_analyzer(detector=Slow(), every=1))
-    worker = StillWorker(
-        rig.stage,
-        results=list,
-        failures=Failures(time.time_ns),
-        clock=lambda: FRAMES[0].capture_ns,
-        max_bytes=4 * frame_bytes + 1,
-    )
+    worker = worker_of(rig, max_bytes=4 * frame_bytes + 1)
     worker.take(frames[0], UNITS[0])
     eventually(lambda: not worker.queued)
     offered = 1
@@ -200,17 +199,10 @@ def test_frames_that_wait_are_bounded_in_bytes(coded_as_it_is):
     counted.set()
     assert offered == 5, "four wait, and one is in hand"
     worker.close()
-    roomy = StillWorker(
-        Rig().stage,
-        results=list,
-        failures=Failures(time.time_ns),
-        clock=lambda: FRAMES[0].capture_ns,
-        max_bytes=1,
-    )
+    roomy = worker_of(Rig(), max_bytes=1)
     assert not roomy.full
     roomy.take(FRAMES[0], UNITS[0])
-    while roomy.queued:
-        time.sleep(0.001)
+    eventually(lambda: not roomy.queued)
     assert not roomy.full, "one frame always has its place"
     roomy.close()
 
@@ -222,18 +214,16 @@ class Blocking:
         self.began, self.released = threading.Event(), threading.Event()
 
     def __call__(self) -> None:
-        """Do it."""
         self.began.set()
         assert self.released.wait(60)
 
 
 def requested_beside(rig: Rig, blocking: Blocking) -> None:
-    """Fly until something blocks; a still that is requested then goes out meanwhile."""
     on_demand = rig.stage.chooser.on_demand
     assert on_demand is not None
     now_ns = FRAMES[0].capture_ns
     failures = Failures(time.time_ns)
-    worker = StillWorker(rig.stage, results=list, failures=failures, clock=lambda: now_ns, finish_s=PATIENT_S)
+    worker = worker_of(rig, failures=failures, clock=lambda: now_ns)
 
     def failing() -> list[str]:
         nonlocal now_ns
@@ -298,7 +288,7 @@ def test_a_requested_still_is_given_up_in_time_though_a_keyframe_goes_first_and_
 def test_where_nobody_takes_the_video_a_request_is_refused_if_stills_are_stored(offline):
     """It was accepted and kept. But one who reads stills alone, of an edge that stores nothing, has it at once."""
     rig = Rig(ring=FrameRing())
-    rig.sender.pacer = Pacer(RateController(RateSettings(ceiling_bps=400_000, floor_bps=100_000)))
+    rig.sender.pacer = Pacer(RateController(ceiling_bps=400_000, floor_bps=100_000))
     rig.sender.pacer.link(there=False, now_ns=FRAMES[0].capture_ns)
     on_demand = rig.stage.chooser.on_demand
     assert on_demand is not None
@@ -344,3 +334,93 @@ def test_a_pending_still_holds_no_frame():
     gc.collect()
     assert watch() is None
     assert len(rig.stage.outbox) == 1
+
+
+def test_while_a_keyframe_is_due_stills_are_held():
+    """A still would take the room that the keyframe waits for."""
+    rig = Rig()
+    assert rig.keyframes.request(FRAMES[0].capture_ns + 500_000_000) is None
+    rig.run()
+    assert rig.out.stills == []
+    rig.keyframes.done(FRAMES[-1].capture_ns)
+    assert len(rig.stage.outbox) == 1
+    rig.stage.chooser.close()
+    assert rig.outcomes["dropped", "ended"] == 1
+
+
+def test_what_the_ground_says_counts_and_no_opinion_does_not():
+    """M3 and M5 would never learn what the classifier sees."""
+    rig = Rig()
+    rig.run(6)
+
+    def known() -> str | None:
+        (candidate,) = rig.stage.chooser.memory.candidates(
+            rig.stage.latest_tracks, view=VIEW, class_names=CLASSES, now_ns=FRAMES[5].capture_ns
+        )
+        return candidate.posterior and candidate.posterior.class_name
+
+    rig.stage.on_results([answer(0, again=False)])
+    assert known() is None
+    rig.stage.on_results([answer(0, again=False, class_name="bus", track_id=one) for one in (1, 99)])
+    assert known() == "bus"
+
+
+def test_the_worker_takes_all_frames_in_order_and_finishes():
+    """The last stills of a clip would be missing."""
+    rig = Rig()
+    with closing(worker_of(rig)) as worker:
+        for frame, unit in zip(FRAMES, UNITS, strict=True):
+            eventually(lambda: worker.queued < 2, what="it is not hurried")
+            worker.take(frame, unit)
+    assert rig.stage.analyzer.frames == 30
+    assert [one.frame_index for one, _ in rig.out.stills] == [0, 15]
+
+
+def test_stills_that_fail_stop_alone_and_go_on_from_a_keyframe(caplog):
+    """A single bad picture would end the flight's video; or the edge look alive and never send a still again."""
+    broken = threading.Event()
+    broken.set()
+
+    class Broken(RedSquares):
+        def detect(self, image_bgr):
+            if broken.is_set():
+                raise RuntimeError("no memory")
+            return super().detect(image_bgr)
+
+    failures, now_ns = Failures(time.time_ns), FRAMES[0].capture_ns
+    rig = Rig(analyzer=make_analyzer(detector=Broken()))
+    with closing(worker_of(rig, failures=failures, clock=lambda: now_ns)) as worker:
+        worker.take(FRAMES[0], UNITS[0])
+        eventually(lambda: failures.parts, what="the failure is noticed")
+        assert not worker.take(FRAMES[1], UNITS[1]), "nothing is analyzed for a while"
+        broken.clear()
+        now_ns += 60 * SECOND_NS
+        assert not worker.full, "the pause is over"
+        assert worker.take(FRAMES[2], UNITS[2]), "and is not decoded: units before it are missing"
+        encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
+        for frame in FRAMES[3:20]:
+            eventually(lambda: worker.queued < 2, what="it is not hurried")
+            worker.take(frame, encoder.encode(frame, keyframe=frame.index == 3))
+    (failed,) = failures.parts
+    assert (failed.part, failed.count, failed.working) == ("stills", 1, True)
+    assert rig.stage.analyzer.tracks == 1, "what is there is tracked again"
+    assert [one.message.split(";")[0] for one in caplog.records] == [
+        "stills: perception and stills stopped (RuntimeError: no memory)",
+        "stills: works again",
+    ]
+
+
+def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
+    """Ctrl-C would hang behind a slow detector, or two threads would use one queue."""
+    rig = Rig(analyzer=make_analyzer(detector=RedSquares(takes_s=0.5)))
+    before = set(threading.enumerate())
+    worker = worker_of(rig, finish_s=0.2)
+    running = set(threading.enumerate()) - before
+    assert {one.name for one in running} == {"hvt-stills"}
+    for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
+        worker.take(frame, unit)
+    worker.close()
+    for thread in running:
+        thread.join(timeout=60)
+    assert running.isdisjoint(threading.enumerate())
+    assert rig.stage.analyzer.frames < 16, "what was not in hand was left"

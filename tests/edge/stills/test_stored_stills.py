@@ -35,27 +35,23 @@ class StillRig(Rig):
     """Base stage and still stage, one after the other for each frame; stills build on the base where they can."""
 
     def __init__(self, folder) -> None:
-        super().__init__(folder, maker=StillMaker(codec=StandIn(), fallback=JpegCodec()))
+        maker = StillMaker(codec=StandIn(), fallback=JpegCodec())
+        super().__init__(folder, maker=maker)
         self.chosen: Counter[tuple[str, str]] = Counter()
+        tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15)
         self.side = make_still_stage(
             self.sender,
-            Analyzer(
-                RedSquares(),
-                ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
-                view=VIEW,
-                detect_every=5,
-            ),
+            Analyzer(RedSquares(), tracker, view=VIEW, detect_every=5),
             keyframes=self.keyframes,
             outcomes=self.chosen,
             view=VIEW,
             class_names=CLASSES,
-            maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
+            maker=maker,
             outbox=self.outbox,
             backlog=self.backlog,
         )
 
     def fly(self, first: int, end: int, *, linked: bool = True) -> None:
-        """Frames of that stretch; nobody reports."""
         self.linked = linked
         for frame in FRAMES[first:end]:
             self.now_ns = frame.capture_ns
@@ -67,11 +63,9 @@ class StillRig(Rig):
 
     @property
     def live(self) -> list[RoiHeader]:
-        """Stills that went into the link."""
         return [RoiHeader.parse(extra, data) for row, data, extra in self.out.puts if row is Channel.ROI]
 
     def stored(self) -> list[RoiHeader]:
-        """Stills that another start of the edge finds, by number."""
         self.close()
         with opened(self.path, session_id=8) as folder:
             stills = [parse_backlog_still(folder.read(entry)) for entry in folder.best_stills()]

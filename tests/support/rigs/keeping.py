@@ -28,7 +28,7 @@ from hvt_edge.config import EdgeConfig, check
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.rate_control import RateController
 from hvt_edge.loop.realtime import LinkControl
 from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_edge.stills.maker import StillMaker
@@ -156,7 +156,7 @@ class Rig:
         self.linked = True
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=60 * S))
         self.outbox, self.ledger = Outbox(), Ledger()
-        pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
+        pacer = Pacer(RateController(ceiling_bps=800_000, floor_bps=100_000)) if adapt else None
         self.pacer = pacer
         self.sender = make_transmitter(
             self.out,

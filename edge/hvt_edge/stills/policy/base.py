@@ -49,7 +49,6 @@ class CostEstimate:
     """Running mean size of the stills sent: the unit in which M5 counts cost."""
 
     def of(self, candidate: Candidate) -> float:
-        """Expected payload bytes of a still of this candidate; never below 1."""
         return self.of_px(candidate.crop_area_px)
 
     def of_px(self, coded_px: float) -> float:
@@ -117,7 +116,6 @@ class Step:
     cost: CostEstimate
     """The expected cost of a still, learnt from stills already sent."""
     allowance_bytes: float
-    """The bytes that the rolling budget would admit now."""
     still_overhead_bytes: float = STILL_OVERHEAD_BYTES
     """Line bytes that a still takes beside its payload: header, framing, transport."""
     from_source: bool = False
@@ -170,7 +168,11 @@ def ranked(
         for candidate in candidates
         if (value := score(candidate)) is not None
     ]
-    return sorted(wanted, key=lambda request: (-request.score, request.candidate.track_id))
+    return _ordered(wanted)
+
+
+def _ordered(requests: Iterable[Request]) -> list[Request]:
+    return sorted(requests, key=lambda request: (-request.score, request.candidate.track_id))
 
 
 def group(
@@ -180,13 +182,11 @@ def group(
     overhead_bytes: float,
     padding: float,
     source_size: tuple[int, int],
-    most: int = MOST_ALSO,
-    max_side_px: int = MAX_SIDE_PX,
-) -> list[tuple[Request, list[Request]]]:
-    """Join the requests of one step into stills: each with its lead and the other requests that it shows.
+) -> list[Request]:
+    """Join the requests of one step into stills, a request for each.
 
     The two stills that save most by becoming one are joined, and again, until no two save a byte; no still
-    shows more than ``most`` tracks beside its lead, nor a side of more than ``max_side_px`` where it shows several.
+    shows more than `MOST_ALSO` tracks beside its lead, nor a side of more than `MAX_SIDE_PX` where it shows several.
     ``overhead_bytes`` are the line bytes of a still beside its payload.
 
     The lead is the most useful request of its group and comes with ``also`` filled and a score of its own: the sum of
@@ -201,17 +201,14 @@ def group(
     board = _Board(
         cost=cost,
         overhead_bytes=overhead_bytes,
-        most=most,
-        max_side_px=max_side_px,
         crops=np.array(crops, np.int64).reshape(-1, 4),
         bytes=single.copy(),
         single_bytes=single,
         members=[[index] for index in range(len(compared))],
     )
     board.join()
-    joined = [board.request(members, compared) for members in board.groups()]
-    joined += [(one, []) for one in requests[_MOST_COMPARED:]]
-    return sorted(joined, key=lambda one: (-one[0].score, one[0].candidate.track_id))
+    joined = [board.request(sorted(members), compared) for members in board.members if members]
+    return _ordered([*joined, *requests[_MOST_COMPARED:]])
 
 
 def union_crop(
@@ -242,10 +239,7 @@ class _Board:
 
     cost: CostEstimate
     overhead_bytes: float
-    most: int
-    max_side_px: int
     crops: npt.NDArray[np.int64]
-    """(N, 4) source pixels."""
     bytes: npt.NDArray[np.float64]
     """(N,) expected line bytes."""
     single_bytes: npt.NDArray[np.float64]
@@ -268,19 +262,13 @@ class _Board:
             savings[lead, lead + 1 :] = fresh[lead + 1 :]
             savings[:lead, lead] = fresh[:lead]
 
-    def groups(self) -> list[list[int]]:
-        """The requests of each still, most useful first."""
-        return [sorted(members) for members in self.members if members]
-
-    def request(self, members: list[int], requests: Sequence[Request]) -> tuple[Request, list[Request]]:
-        """One still's request, and the other requests that it serves."""
-        lead, others = requests[members[0]], [requests[index] for index in members[1:]]
+    def request(self, members: list[int], requests: Sequence[Request]) -> Request:
+        lead, *others = (requests[index] for index in members)
         if not others:
-            return lead, []
+            return lead
         gain = sum(requests[index].score * self.single_bytes[index] for index in members)
         also = tuple(sorted((one.candidate for one in others), key=lambda one: one.track_id))
-        score = max(lead.score, float(gain / self.bytes[members[0]]))
-        return replace(lead, also=also, score=score), others
+        return replace(lead, also=also, score=max(lead.score, float(gain / self.bytes[members[0]])))
 
     def _savings(self, row: int) -> npt.NDArray[np.float64]:
         # (N,) line bytes saved by joining this still with each other one; -inf where that is not allowed.
@@ -291,7 +279,7 @@ class _Board:
         together = tracks + tracks[row]
         union = self._line_bytes(sides.prod(axis=1), together)
         savings = np.asarray(self.bytes + self.bytes[row] - union, np.float64)
-        savings[(sides.max(axis=1) > self.max_side_px) | (together > self.most + 1) | (tracks == 0)] = -np.inf
+        savings[(sides.max(axis=1) > MAX_SIDE_PX) | (together > MOST_ALSO + 1) | (tracks == 0)] = -np.inf
         savings[row] = -np.inf
         return savings
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
-from functools import partial
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -21,7 +20,7 @@ from hvt_edge.stills.policy.paper import (
     Utility,
     VideoOnly,
 )
-from hvt_edge.stills.policy.selectors import SELECTORS, SelectorMethod
+from hvt_edge.stills.policy.selectors import SELECTORS
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,24 +32,11 @@ class MethodEntry:
     """Name and default of the parameters of ``--tune``."""
 
 
-def _entry(make: type[Any]) -> MethodEntry:
-    defaults = make()
-    tunable: dict[str, float] = {one.name: getattr(defaults, one.name) for one in fields(make)}
-    return MethodEntry(make, MappingProxyType(tunable))
-
-
+_PAPER: tuple[type[Any], ...] = (VideoOnly, Periodic, OnStart, Uncertain, Small, Utility)
+_OURS: tuple[type[Any], ...] = (ExpectedGain, TracksFirst)
 METHODS: Mapping[str, MethodEntry] = MappingProxyType(
-    {
-        "M0": _entry(VideoOnly),
-        "M1": _entry(Periodic),
-        "M2": _entry(OnStart),
-        "M3": _entry(Uncertain),
-        "M4": _entry(Small),
-        "M5": _entry(Utility),
-        "M6": _entry(ExpectedGain),
-        "R0": _entry(TracksFirst),
-        **{row.name: MethodEntry(partial(SelectorMethod, row), MappingProxyType({})) for row in SELECTORS},
-    }
+    {kind.name: MethodEntry(kind, MappingProxyType(asdict(kind()))) for kind in _PAPER + _OURS}
+    | {row.name: MethodEntry(lambda row=row: row, MappingProxyType({})) for row in SELECTORS}
 )
 
 

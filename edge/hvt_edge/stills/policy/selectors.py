@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.class_names import same_kind
 from hvt_common.values import Boxes
-from hvt_edge.stills.policy.base import Method, Request, Step
+from hvt_edge.stills.policy.base import Request, Step
 
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
@@ -25,7 +25,7 @@ _ROAD_USERS = ("car", "truck", "bus", "person")
 
 @dataclass(frozen=True, slots=True)
 class Selector:
-    """One row of the pilot's table."""
+    """One row of the pilot's table, and a `Method`."""
 
     name: str
     min_confidence: float
@@ -39,6 +39,45 @@ class Selector:
     small_weight: float
     doubt_weight: float
     """The order is ``small_weight · small + doubt_weight · (1 - confidence)``, highest first."""
+    video_only: ClassVar[bool] = False
+
+    def select(
+        self,
+        boxes_xyxy_px: Boxes,
+        confidences: npt.ArrayLike,
+        class_names: Sequence[str],
+        frame_area_px: float,
+    ) -> list[tuple[int, float, bool]]:
+        """(index, score, whether it is small) of the detections of one frame that the selector takes, best first.
+
+        Ties keep the detections' order. ``boxes_xyxy_px`` is (N, 4) in base pixels, ``class_names`` the N names of
+        the detections' classes.
+        """
+        confidence = np.asarray(confidences, np.float64).reshape(-1)
+        boxes = np.asarray(boxes_xyxy_px, np.float64).reshape(-1, 4)
+        width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
+        small = width * height / frame_area_px < self.small_share
+        passed = np.array([self._takes(name) for name in class_names], np.bool_)
+        passed &= (width >= self.min_side_px) & (height >= self.min_side_px)
+        passed &= confidence >= self.min_confidence
+        score = self.small_weight * small + self.doubt_weight * (1 - confidence)
+        indices = np.flatnonzero(passed)
+        best = indices[np.argsort(-score[indices], kind="stable")[: self.per_frame]]
+        return list(zip(best.tolist(), score[best].tolist(), small[best].tolist(), strict=True))
+
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
+        """At most ``per_frame`` requests, of detections of this very frame; nothing between detections."""
+        seen = sorted((one for one in candidates if one.detected), key=lambda one: one.track_id)
+        boxes = np.array([one.box_base_px for one in seen], np.float32)
+        confidences, names = [one.confidence for one in seen], [one.class_name for one in seen]
+        area = float(step.base_size[0] * step.base_size[1])
+        return [
+            Request(seen[index], "small" if small else "low confidence", score)
+            for index, score, small in self.select(boxes, confidences, names, area)
+        ]
+
+    def _takes(self, class_name: str) -> bool:
+        return self.kinds is None or any(same_kind(class_name, kind) for kind in self.kinds)
 
 
 SELECTORS: tuple[Selector, ...] = (
@@ -47,55 +86,3 @@ SELECTORS: tuple[Selector, ...] = (
     Selector("strict_small_only", 0.50, 1, 12, _ROAD_USERS, 0.020, 10, 1e-6),
     Selector("balanced_top2", 0.40, 2, 12, _ROAD_USERS, 0.015, 1, 2),
 )
-
-
-def select(
-    selector: Selector,
-    boxes_xyxy_px: Boxes,
-    confidences: npt.ArrayLike,
-    class_names: Sequence[str],
-    frame_area_px: float,
-) -> list[tuple[int, float, bool]]:
-    """(index, score, whether it is small) of the detections of one frame that the selector takes, best first.
-
-    Ties keep the detections' order. ``boxes_xyxy_px`` is (N, 4) in base pixels, ``class_names`` the N names of the
-    detections' classes.
-    """
-    confidence = np.asarray(confidences, np.float64).reshape(-1)
-    boxes = np.asarray(boxes_xyxy_px, np.float64).reshape(-1, 4)
-    width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
-    small = width * height / frame_area_px < selector.small_share
-    kinds = selector.kinds
-    allowed = {
-        name: kinds is None or any(same_kind(name, kind) for kind in kinds) for name in set(class_names)
-    }
-    passed = np.array([allowed[name] for name in class_names], np.bool_)
-    passed &= (width >= selector.min_side_px) & (height >= selector.min_side_px)
-    passed &= confidence >= selector.min_confidence
-    score = selector.small_weight * small + selector.doubt_weight * (1 - confidence)
-    indices = np.flatnonzero(passed)
-    best = indices[np.argsort(-score[indices], kind="stable")[: selector.per_frame]]
-    return list(zip(best.tolist(), score[best].tolist(), small[best].tolist(), strict=True))
-
-
-@dataclass(frozen=True, slots=True)
-class SelectorMethod(Method):
-    """A selector as a method: it uses only candidates backed by a detection of this very frame."""
-
-    selector: Selector
-
-    @property
-    def name(self) -> str:
-        return self.selector.name
-
-    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
-        """At most ``per_frame`` requests; nothing on frames between detections."""
-        seen = sorted((one for one in candidates if one.detected), key=lambda one: one.track_id)
-        boxes = np.array([one.box_base_px for one in seen], np.float32).reshape(-1, 4)
-        confidence = np.array([one.confidence for one in seen], np.float64)
-        names = [one.class_name for one in seen]
-        area = float(step.base_size[0] * step.base_size[1])
-        return [
-            Request(seen[index], "small" if small else "low confidence", score)
-            for index, score, small in select(self.selector, boxes, confidence, names, area)
-        ]

@@ -20,27 +20,19 @@ M6 = ExpectedGain()
 
 
 def step(**changes) -> Step:
-    """A still costs 500 bytes of payload and 180 beside it."""
     plain = {"cost": CostEstimate(500, 0, 500), "still_overhead_bytes": 180}
     return decision_step(**(plain | changes))
 
 
 def car(track_id: int = 1, *, lost: float = 0.5, sharp: float = 500.0, **changes) -> Candidate:
-    """Half a blur."""
     box = (100.0, 100.0, 132.0, 132.0)
     plain = {"box_source_px": (200, 200, 264, 264), "area_share": 0.001, "loss": lambda: BaseLoss(28.0, lost)}
     return candidate(track_id, box, **(plain | {"sharpness": lambda: sharp} | changes))
 
 
 def sent(one: Candidate, *, seconds: float, **changes) -> Candidate:
-    """As it is some seconds after a still of the same view."""
-    plain = {
-        "sent_count": 1,
-        "last_sent_ns": round(NOW - seconds * 1e9),
-        "last_sent_area_px": one.area_px,
-        "posterior": ClassPosterior("car", 0.95, 0.1),
-    }
-    return replace(one, **{**plain, **changes})
+    plain = {"sent_count": 1, "last_sent_ns": round(NOW - seconds * 1e9), "last_sent_area_px": one.area_px}
+    return replace(one, **(plain | {"posterior": ClassPosterior("car", 0.95, 0.1)} | changes))
 
 
 def test_known_answer():
@@ -98,15 +90,12 @@ def test_gain_is_a_chance_and_monotone_in_every_term(lost, confidence, area, cov
     gain = M6.gain(one, moment)
     assert 0 <= gain <= 1
     slack = 1e-12
-    assert (
-        M6.gain(car(lost=min(1, lost + 0.1), confidence=confidence, covered_share=covered), moment)
-        >= gain - slack
-    )
+    more = [{"loss": lambda: BaseLoss(28.0, min(1, lost + 0.1))}, {"covered_share": covered * area}]
     if not source:  # there, a detection that is unsure on the source itself will not be sure on its still
-        assert M6.gain(replace(one, confidence=confidence * 0.9), moment) >= gain - slack
-    assert M6.gain(replace(one, covered_share=covered * area), moment) >= gain - slack
-    assert M6.gain(replace(one, touches_border=True), moment) <= gain + slack
-    assert M6.gain(replace(one, sharpness=lambda: 20.0), moment) <= gain + slack
+        more.append({"confidence": confidence * 0.9})
+    assert all(M6.gain(replace(one, **changes), moment) >= gain - slack for changes in more)
+    for changes in ({"touches_border": True}, {"sharpness": lambda: 20.0}):
+        assert M6.gain(replace(one, **changes), moment) <= gain + slack
     known = sent(one, seconds=since)
     assert M6.gain(known, moment) <= max(gain, M6.again) + slack
     if gain > 0.1:
@@ -121,10 +110,10 @@ def test_the_ground_s_answer_decides_whether_another_still_is_worth_it():
     assert M6.requests([sent(one, seconds=2)], step()) == []
     unsure = sent(one, seconds=2, posterior=ClassPosterior("car", 0.2, 3.0))
     assert M6.gain(unsure, step()) > 3 * M6.gain(sent(one, seconds=2), step())
-    odd = sent(one, seconds=2, posterior=ClassPosterior("bus", 0.95, 0.1))
-    assert M6.gain(odd, step()) > M6.gain(
-        sent(one, seconds=2, posterior=ClassPosterior("minivan", 0.95, 0.1)), step()
+    odd, even = (
+        sent(one, seconds=2, posterior=ClassPosterior(name, 0.95, 0.1)) for name in ("bus", "minivan")
     )
+    assert M6.gain(odd, step()) > M6.gain(even, step())
     moving = sent(replace(one, class_name="moving"), seconds=2)
     assert M6.gain(moving, step()) == M6.gain(sent(one, seconds=2), step())
     whole = replace(unsure, last_sent_at_border=True)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.policy.selectors import SELECTORS, select
+from hvt_edge.stills.policy.selectors import SELECTORS
 from rigs.examples import candidate, decision_step
 
 BY_NAME = {row.name: row for row in SELECTORS}
@@ -33,13 +33,11 @@ ORDER = {
 }
 
 
-def selected(*given) -> list[int]:
-    """The indices alone."""
-    return [index for index, *_ in select(*given)]
+def selected(selector, *given) -> list[int]:
+    return [index for index, *_ in selector.select(*given)]
 
 
 def by_hand(name: str, boxes, confidences, names, area) -> list[int]:
-    """The selection in plain loops."""
     least, top, side, classes, share = TABLE[name]
     rows = []
     for index, (box, confidence, word) in enumerate(zip(boxes, confidences, names, strict=True)):
@@ -103,21 +101,16 @@ def test_selectors_agree_on_real_detections(data, word):
 
 def test_known_answer():
     """The order by smallness and doubt would be turned round without anyone noticing."""
-    boxes = np.array(
-        [
-            (0, 0, 200, 200),  # large, 0.45
-            (0, 0, 30, 30),  # small, 0.90
-            (50, 0, 80, 30),  # small, 0.55
-            (0, 0, 11, 40),  # too narrow for most, 0.60
-            (90, 0, 120, 30),  # small tricycle, 0.42
-            (0, 300, 30, 330),  # small, 0.30
-            (0, 400, 130, 505),  # 0.0148 of the frame: small everywhere, 0.95
-            (0, 400, 130, 540),  # 0.0197: small for strict_small_only alone, 0.51
-        ],
-        np.float32,
-    )
-    confidences = np.array([0.45, 0.90, 0.55, 0.60, 0.42, 0.30, 0.95, 0.51], np.float32)
-    names = ["car", "van", "pedestrian", "car", "tricycle", "car", "bus", "truck"]
+    rows = [
+        ((0, 0, 200, 200), 0.45, "car"),  # large
+        ((0, 0, 30, 30), 0.90, "van"),
+        ((50, 0, 80, 30), 0.55, "pedestrian"),
+        ((0, 0, 11, 40), 0.60, "car"),  # too narrow for most
+        ((90, 0, 120, 30), 0.42, "tricycle"),
+        ((0, 300, 30, 330), 0.30, "car"),
+        ((0, 400, 130, 505), 0.95, "bus"),  # 0.0148 of the frame: small everywhere
+        ((0, 400, 130, 540), 0.51, "truck"),  # 0.0197: small for strict_small_only alone
+    ]
     expected = {
         "permissive": [5, 4, 2],
         "conf_size_top1": [2],
@@ -125,44 +118,32 @@ def test_known_answer():
         "balanced_top2": [2, 1],
     }
     for name, indices in expected.items():
-        assert selected(BY_NAME[name], boxes, confidences, names, AREA) == indices
+        assert selected(BY_NAME[name], *zip(*rows, strict=True), AREA) == indices
 
 
-def test_strict_small_only_falls_back_to_what_is_not_small():
-    """The pilot's selector keeps one ROI a frame even where nothing is small; the name misleads."""
-    boxes = np.array([(0, 0, 300, 300), (0, 0, 400, 300)], np.float32)
-    chosen = selected(BY_NAME["strict_small_only"], boxes, np.array([0.9, 0.8]), ["car", "car"], AREA)
-    assert chosen == [1]
-
-
-def test_ties_keep_the_order_of_detection():
-    """The same frame would give another ROI on another machine."""
-    boxes = np.array([(0, 0, 30, 30)] * 5, np.float32)
-    chosen = selected(BY_NAME["permissive"], boxes, np.full(5, 0.5), ["car"] * 5, AREA)
-    assert chosen == [0, 1, 2]
-    assert selected(BY_NAME["permissive"], np.empty((0, 4)), np.empty(0), [], AREA) == []
+def test_what_is_not_small_is_fallen_back_to_and_ties_keep_the_order_of_detection():
+    """The pilot's selector keeps one ROI a frame even where nothing is small; or each machine would keep another."""
+    strict, permissive = BY_NAME["strict_small_only"], BY_NAME["permissive"]
+    large = [(0, 0, 300, 300), (0, 0, 400, 300)]
+    assert selected(strict, large, [0.9, 0.8], ["car", "car"], AREA) == [1]
+    assert selected(permissive, [(0, 0, 30, 30)] * 5, [0.5] * 5, ["car"] * 5, AREA) == [0, 1, 2]
+    assert selected(permissive, np.empty((0, 4)), np.empty(0), [], AREA) == []
 
 
 def test_as_a_method_only_this_frame_s_detections_count():
     """A predicted box, of which no detector says that it is there, would be sent."""
-    moment = decision_step(5)
-
-    def one(track_id, confidence, *, detected=True, side=40.0):
-        box = (0.0, 0.0, side, side)
-        share = side * side / AREA
-        return candidate(
-            track_id, box, frame_index=5, confidence=confidence, area_share=share, detected=detected
-        )
-
     some = [
-        one(1, 0.9),
-        one(2, 0.41, detected=False),
-        one(3, 0.6),
-        one(4, 0.45, side=200.0),
-        one(5, 0.95, side=200.0),
+        candidate(track_id, (0.0, 0.0, side, side), frame_index=5, confidence=confidence, detected=detected)
+        for track_id, confidence, side, detected in (
+            (1, 0.9, 40.0, True),
+            (2, 0.41, 40.0, False),
+            (3, 0.6, 40.0, True),
+            (4, 0.45, 200.0, True),
+            (5, 0.95, 200.0, True),
+        )
     ]
-    wanted = method("balanced_top2").requests(some, moment)
+    wanted = method("balanced_top2").requests(some, decision_step(5))
     assert [(each.candidate.track_id, each.reason) for each in wanted] == [(3, "small"), (1, "small")]
     assert wanted[0].score == pytest.approx(2 * 0.4 + 1)
-    alone = method("balanced_top2").requests([some[3]], moment)
+    alone = method("balanced_top2").requests([some[3]], decision_step(5))
     assert [each.reason for each in alone] == ["low confidence"]
