@@ -1,7 +1,5 @@
 """A drawn aerial scene as a continuous function of time: pictures and their exact ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from functools import cached_property
 from pathlib import Path
@@ -272,7 +270,6 @@ class Scene:
             blend(frame, boxes[row], picture, matrix=matrix, gain=float(gains[row]))
 
     def _draw_trees(self, frame: Bgra, pose: Matrix) -> None:
-        """Crowns that hang over objects below them."""
         grove = self._grove
         local = tangents(pose, grove.places_m)
         half = 1.05 * grove.radii_m

@@ -1,7 +1,5 @@
 """The exact ground truth of a scene, and its file in the layout of MOTChallenge."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Pixel (0, 0) covers 0…1 on both axes, so its centre lies at 0.5; OpenCV puts i
 A frame has four channels while it is built: OpenCV warps those fastest.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

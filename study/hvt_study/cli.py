@@ -1,7 +1,5 @@
 """``hvt-study``: the command line of the study."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import sys

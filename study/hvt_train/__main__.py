@@ -1,7 +1,5 @@
 """``python -m hvt_train``: train the embedded models, or measure them."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """How good the embedded models are, on held-out drawn scenes and a real clip: the figures of ``docs/models.md``."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Sequence

@@ -12,8 +12,6 @@ aerial ones: strides of 16, 32 and 64 pixels. Three rules keep it to its views:
 * a box around nearly the whole picture is no object.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

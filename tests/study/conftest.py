@@ -1,7 +1,5 @@
 """What several tests of the study share, made once."""
 
-from __future__ import annotations
-
 import pytest
 
 from studies.small_study import write_scene

@@ -1,7 +1,5 @@
 """Programs in an install without the extra that they need: one sentence that says what to install."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -29,72 +27,42 @@ def done(tmp_path, module, words, without):
     """The program in a Python that finds none of these packages."""
     (tmp_path / "sitecustomize.py").write_text(BLOCK.format(names=without))
     paths = [str(tmp_path), os.environ.get("PYTHONPATH", "")]
-    return subprocess.run(
-        [sys.executable, "-m", module, *words],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    command = [sys.executable, "-m", module, *words]
+    return subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+
+def nightly(*case):
+    return pytest.param(*case, marks=pytest.mark.nightly)
+
+
+STUDIED = "hvt_study.cli"
 
 
 @pytest.mark.parametrize(
     ("module", "words", "without", "install"),
     [
-        ("hvt_study.cli", ("run", "demo:0", "--out", "out"), (*STUDY, *GROUND), "hvt[study]"),
-        pytest.param(
-            "hvt_study.cli",
-            ("compare", "demo", "--detector", "aerial-nano", "--out", "o"),
-            GROUND,
-            "hvt[study]",
-            marks=pytest.mark.nightly,
-        ),
-        pytest.param(
-            "hvt_study.cli", ("plan", "demo:0"), ("rerun",), "hvt[study]", marks=pytest.mark.nightly
-        ),
-        pytest.param(
-            "hvt_study.cli",
-            ("tune", "demo:0-1", "--method", "M5", "--out", "out"),
-            ("optuna",),
-            "hvt[study]",
-            marks=pytest.mark.nightly,
-        ),
-        pytest.param(
-            "hvt_study.cli", ("report", "out"), ("jinja2",), "hvt[study]", marks=pytest.mark.nightly
-        ),
-        ("hvt_study.cli", ("read", "demo:codes", "--out", "out"), ("rapidocr",), "hvt[reading]"),
-        ("hvt_train", ("curve", "log.jsonl", "--out", "out.svg"), ("matplotlib",), "hvt[study]"),
-        pytest.param(
-            "hvt_study.cli",
-            ("score", "a.csv", "--truth", "gt.txt"),
-            ("sklearn",),
-            "hvt[study]",
-            marks=pytest.mark.nightly,
-        ),
-        ("hvt_ground.cli", ("--connect", "tcp/127.0.0.1:9"), ("rerun",), "hvt[ground]"),
-        (
-            "hvt_ground.cli",
-            ("--cot", "udp://127.0.0.1:9", "--connect", "tcp/127.0.0.1:9"),
-            ("pytak",),
-            "hvt[cot]",
-        ),
-        (
-            "hvt_edge.cli",
-            ("--source", "demo", "--metrics", "127.0.0.1:1"),
-            ("prometheus_client",),
-            "hvt[metrics]",
-        ),
-        ("hvt_ground.cli", ("keys", "list"), ("cryptography",), "hvt[ground]"),
-        ("hvt_train", ("detector", "--out", "out"), ("torch",), "torch onnx"),
-        ("hvt_study.cli", ("train", "--data", "yolo:a", "--out", "b.onnx"), ("torch",), "torch onnx"),
+        (STUDIED, "run demo:0 --out out", (*STUDY, *GROUND), "hvt[study]"),
+        nightly(STUDIED, "compare demo --detector aerial-nano --out o", GROUND, "hvt[study]"),
+        nightly(STUDIED, "plan demo:0", ("rerun",), "hvt[study]"),
+        nightly(STUDIED, "tune demo:0-1 --method M5 --out out", ("optuna",), "hvt[study]"),
+        nightly(STUDIED, "report out", ("jinja2",), "hvt[study]"),
+        (STUDIED, "read demo:codes --out out", ("rapidocr",), "hvt[reading]"),
+        ("hvt_train", "curve log.jsonl --out out.svg", ("matplotlib",), "hvt[study]"),
+        nightly(STUDIED, "score a.csv --truth gt.txt", ("sklearn",), "hvt[study]"),
+        ("hvt_ground.cli", "--connect tcp/127.0.0.1:9", ("rerun",), "hvt[ground]"),
+        ("hvt_ground.cli", "--cot udp://127.0.0.1:9 --connect tcp/127.0.0.1:9", ("pytak",), "hvt[cot]"),
+        ("hvt_edge.cli", "--source demo --metrics 127.0.0.1:1", ("prometheus_client",), "hvt[metrics]"),
+        ("hvt_ground.cli", "keys list", ("cryptography",), "hvt[ground]"),
+        ("hvt_train", "detector --out out", ("torch",), "torch onnx"),
+        (STUDIED, "train --data yolo:a --out b.onnx", ("torch",), "torch onnx"),
     ],
 )
 def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, install):
     """Who installed hvt[edge] would get a traceback that names a package of somebody else."""
     (tmp_path / "a.csv").write_text("frame,x,y,w,h,class\n1,0,0,9,9,car\n")
     (tmp_path / "gt.txt").write_text("1,1,0,0,9,9,1,1,1\n")
-    found = done(tmp_path, module, words, without)
+    found = done(tmp_path, module, words.split(), without)
     assert found.returncode == 2, found.stderr
     assert f"pip install {install}".replace("hvt[", "'hvt[").replace("]", "]'") in found.stderr
     assert len([one for one in found.stderr.splitlines() if "opening what they need" not in one]) == 1

@@ -1,7 +1,5 @@
 """Drawing in metres: a small canvas on which sprites are painted at a fixed fine resolution."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

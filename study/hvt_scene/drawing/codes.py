@@ -5,8 +5,6 @@ alike: there is one of O and 0, B and 8, S and 5, Z and 2, G and 6 or C, I and 1
 another one upside down.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Tree canopies seen from above: clumps of leaves, lit from the side the sun stands on."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import numpy.typing as npt

@@ -1,7 +1,5 @@
 """The ground as one large picture: surfaces with noise of several scales, markings, roofs, trees, their shadows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -251,7 +249,6 @@ def _paint_crossing(painter: _Painter, layout: Layout) -> None:
 
 
 def _paint_court(painter: _Painter, rect: Rect) -> None:
-    """Two tennis courts side by side."""
     middle = (rect.x0 + rect.x1) / 2
     for x0, x1 in ((rect.x0 + 2, middle - 1), (middle + 1, rect.x1 - 2)):
         field = Rect(x0, rect.y0 + 2, x1, rect.y1 - 2)
@@ -292,7 +289,6 @@ def _paint_panels(painter: _Painter, area: Rect) -> None:
 
 
 def _paint_units(painter: _Painter, area: Rect, rng: _Rng) -> None:
-    """Air handling boxes with fans, and skylights."""
     for _ in range(int(area.size[0] * area.size[1] / 70) + 1):
         x, y = float(rng.uniform(area.x0, area.x1)), float(rng.uniform(area.y0, area.y1))
         wide, deep = float(rng.uniform(0.6, 1.6)), float(rng.uniform(0.5, 1.2))
@@ -348,7 +344,6 @@ def _noise(rng: _Rng, shape: tuple[int, int], *, cell_px: float) -> npt.NDArray[
 def _enlarged(
     noise: npt.NDArray[np.float32], shape: tuple[int, int], *, gain: float
 ) -> npt.NDArray[np.float32]:
-    """The noise, smooth, over the whole world."""
     large = np.asarray(cv2.resize(noise, shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
     large *= np.float32(gain)
     return large

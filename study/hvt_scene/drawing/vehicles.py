@@ -4,8 +4,6 @@ The classes overlap in size, outline and paint on purpose. Fine detail tells the
 and ribs, planks and cargo in a bed, hatches and fans on a bus. Base resolution and bitrate lose it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Moving objects: vehicles that follow their leader and the lights, cars that circle car parks, people on foot."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

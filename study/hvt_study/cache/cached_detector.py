@@ -5,8 +5,6 @@ all that decides it: the content of the model file, its provider, the code and t
 way, and the pixels. One that was cut off or changed is asked for again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import time
 from functools import cache
@@ -20,19 +18,11 @@ from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.model_file import files_of
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
-from hvt_study.cache.results import (
-    DETECTING,
-    code_digest,
-    file_digest,
-    installed,
-    make_folder,
-    read_whole,
-    write_whole,
-)
+from hvt_study.cache import results
 
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""
-digest_of_file = cache(file_digest)
+digest_of_file = cache(results.file_digest)
 """Once in a study: a model that is changed under a running one is not noticed by it."""
 
 
@@ -51,11 +41,11 @@ class CachedDetector(OnnxDetector):
             *(digest_of_file(file.resolve()) for file in files_of(path)),
             self.model.provider.provider,
             f"{confidence:g}",
-            f"code {code_digest(*DETECTING)}",
-            *(f"{name} {number}" for name, number in installed(_PACKAGES).items()),
+            f"code {results.code_digest(*results.DETECTING)}",
+            *(f"{name} {number}" for name, number in results.installed(_PACKAGES).items()),
         )
         self._name = " ".join(said).encode()
-        self._folder = make_folder(folder)
+        self._folder = results.make_folder(folder)
         self.saved_cpu_s = 0.0
         """The cost of the answers out of memory, less that of remembering."""
 
@@ -82,7 +72,7 @@ class CachedDetector(OnnxDetector):
 
 def _read(path: Path) -> tuple[Detections, float] | None:
     """The answer there; None where there is none, or no whole one."""
-    body = read_whole(path)
+    body = results.read_whole(path)
     if body is None:
         return None
     cost_s, boxes, confidences, class_ids = msgpack.unpackb(body)
@@ -96,4 +86,6 @@ def _read(path: Path) -> tuple[Detections, float] | None:
 
 def _write(path: Path, found: Detections, cost_s: float) -> None:
     arrays = (found.boxes_xyxy_px, "<f4"), (found.confidences, "<f4"), (found.class_ids, "<i4")
-    write_whole(path, msgpack.packb([cost_s, *(one.astype(dtype).tobytes() for one, dtype in arrays)]))
+    results.write_whole(
+        path, msgpack.packb([cost_s, *(one.astype(dtype).tobytes() for one, dtype in arrays)])
+    )

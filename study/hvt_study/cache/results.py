@@ -4,8 +4,6 @@ Each carries a checksum of its own. One that was cut off or changed is thrown aw
 HVT's own code counts by its content: a version that stays the same through a hundred edits does not identify it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

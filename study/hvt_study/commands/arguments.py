@@ -1,7 +1,5 @@
 """The arguments that ``run``, ``plan`` and ``tune`` share, and the plan that they make."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

@@ -13,25 +13,8 @@ from types import MappingProxyType
 from hvt_common.errors import UserError
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.runtime.reporting import write_json
-from hvt_study.commands.arguments import (
-    add_pool_arguments,
-    base_size,
-    check_means,
-    flown_frames,
-    names_of,
-    open_pool,
-    option,
-    parse_rates,
-)
-from hvt_study.commands.output import (
-    RunProgress,
-    check_out,
-    decimals,
-    print_columns,
-    print_lines,
-    share,
-    writing,
-)
+from hvt_study.commands import arguments as common
+from hvt_study.commands import output
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.datasets.virtual_camera import SCHEME
 from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, CompareRow, compare
@@ -60,39 +43,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Clip, models, rates, methods, and where the results go."""
     parser.add_argument("clip", metavar="CLIP", help=_CLIPS)
     help_text = "detector of the ground and of reference labels: FILE.onnx or a model's name"
-    option(parser, "--detector", required=True, help=help_text)
-    option(parser, "--edge-detector")
-    option(parser, "--rates", default="150,200,300,400,800")
-    option(parser, "--methods", default=",".join(COMPARED))
-    option(parser, "--out", help="compare.json, compare.png, and cache, where finished flights lie")
+    common.option(parser, "--detector", required=True, help=help_text)
+    common.option(parser, "--edge-detector")
+    common.option(parser, "--rates", default="150,200,300,400,800")
+    common.option(parser, "--methods", default=",".join(COMPARED))
+    common.option(parser, "--out", help="compare.json, compare.png, and cache, where finished flights lie")
     size = "size of the base stream (default: 1280x720, or what the source fills of it)"
-    option(parser, "--size", default=argparse.SUPPRESS, help=size)
-    option(parser, "--max-frames", default=300)
-    add_pool_arguments(parser)
+    common.option(parser, "--size", default=argparse.SUPPRESS, help=size)
+    common.option(parser, "--max-frames", default=300)
+    common.add_pool_arguments(parser)
     parser.add_argument(
         "--labels",
         default="auto",
         choices=("auto", "exact", "reference"),
         help="what counts as true: exact labels of the source, or reference: the detector on untouched frames",
     )
-    option(parser, "--classes")
-    option(parser, "--labelled")
-    option(parser, "--provider")
+    common.option(parser, "--classes")
+    common.option(parser, "--labelled")
+    common.option(parser, "--provider")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    check_means(arguments)
+    common.check_means(arguments)
     plan = _plan(arguments)
     folder: Path = arguments.out
-    file = check_out(folder, name="compare.json")
-    opened, jobs = open_pool(arguments)
-    with RunProgress("flights") as progress, opened as pool:
+    file = output.check_out(folder, name="compare.json")
+    opened, jobs = common.open_pool(arguments)
+    with output.RunProgress("flights") as progress, opened as pool:
         result = compare(plan, pool=pool, workers=jobs, on_flights=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
     from hvt_study.report.figures.drawing import plot  # noqa: PLC0415 - Matplotlib, before it says a word
 
-    with writing(folder):
+    with output.writing(folder):
         write_json(file, list(result.rows))
         plot(result, folder / "compare.png")
     print_result(result)
@@ -107,29 +90,29 @@ def print_result(result: CompareResult) -> None:
         (
             f"{whole['rate_kbps']:g}",
             whole["method"],
-            share(whole[headline]),
-            f"{share(first[headline])} {share(second[headline])}",
+            output.share(whole[headline]),
+            f"{output.share(first[headline])} {output.share(second[headline])}",
             *(_held(whole) if result.one_target else _listed(whole)),
         )
         for whole, first, second in result.flights
     )
     heads = ("kbps", "method", *(_ONE_TARGET_HEADS if result.one_target else _HEADS))
-    print_columns(f"{result.clip}, {result.labels} labels", heads, rows, words=("method",), gap=1)
-    print_lines(_ONE_TARGET_LEGEND if result.one_target else _LEGEND)
+    output.print_columns(f"{result.clip}, {result.labels} labels", heads, rows, words=("method",), gap=1)
+    output.print_lines(_ONE_TARGET_LEGEND if result.one_target else _LEGEND)
     for one in result.missing:
-        print_lines(f"{one.method} at {one.rate_kbps:g} kbps: not available, {one.reason}")
+        output.print_lines(f"{one.method} at {one.rate_kbps:g} kbps: not available, {one.reason}")
 
 
 def print_verdicts(found: Sequence[Verdict]) -> None:
     """Print the best method at each rate, and its settings."""
     for one in found:
-        print_lines(f"\n{one.sentence}", *([f"fly this: {one.command}"] if one.command else []))
+        output.print_lines(f"\n{one.sentence}", *([f"fly this: {one.command}"] if one.command else []))
 
 
 def _listed(row: CompareRow) -> tuple[str, ...]:
     return (
-        decimals(row["false_per_frame"], 1),
-        share(row["class_agreement"]),
+        output.decimals(row["false_per_frame"], 1),
+        output.share(row["class_agreement"]),
         f"{row['total_bps'] / 1e3:.0f}",
         f"{row['base_bps'] / 1e3:.0f}",
         f"{row['roi_bps'] / 1e3:.0f}",
@@ -143,7 +126,7 @@ def _held(row: CompareRow) -> tuple[str, ...]:
     counts = ("-" if row[name] is None else str(row[name]) for name in ("gaps", "id_switches"))
     gaps, switches = counts
     total = f"{row['total_bps'] / 1e3:.0f}"
-    return share(named), gaps, decimals(row["longest_gap_s"], 1), switches, total, *_pace(row)
+    return output.share(named), gaps, output.decimals(row["longest_gap_s"], 1), switches, total, *_pace(row)
 
 
 def _pace(row: CompareRow) -> tuple[str, ...]:
@@ -158,14 +141,14 @@ def _plan(arguments: argparse.Namespace) -> ComparePlan:
             edge_detector=getattr(arguments, "edge_detector", arguments.detector),
             provider=arguments.provider,
         ),
-        rates_bps=parse_rates(arguments.rates),
+        rates_bps=common.parse_rates(arguments.rates),
         cache=(arguments.out / "cache").absolute(),
         methods=chosen_names(arguments.methods, COMPARED),
-        size=base_size(arguments.size) if hasattr(arguments, "size") else None,
-        max_frames=flown_frames(arguments.max_frames),
+        size=common.base_size(arguments.size) if hasattr(arguments, "size") else None,
+        max_frames=common.flown_frames(arguments.max_frames),
         labels=arguments.labels,
-        classes=names_of(arguments.classes),
-        labelled=names_of(arguments.labelled),
+        classes=common.names_of(arguments.classes),
+        labelled=common.names_of(arguments.labelled),
     )
 
 

@@ -1,7 +1,5 @@
 """``hvt-study demo``: compares several flights of the drawn scene by their tracks and by the readable codes."""
 
-from __future__ import annotations
-
 import argparse
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +36,7 @@ def _print(compared: Compared) -> None:
         read, alone = "-", "-"
         if compared.legible is not None:
             legible = compared.legible[number]
-            read = f"{len(legible.every)} of {len(compared.codes)}"
+            read = f"{len(legible.every)} of {len(compared.painted.codes)}"
             alone = f"{len(legible.every - compared.legible[0].video - legible.video)}"
         figures = (f"{score.named_f1:.3f}", f"{score.false_per_frame:.1f}", f"{score.counts.top1_found:.3f}")
         rows.append((one.name, *figures, read, alone, f"{one.total_bps / 1e3:.0f}"))

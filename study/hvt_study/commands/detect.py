@@ -1,7 +1,5 @@
 """``hvt-study detect``: how good a detector is on pictures, in figures and in sheets to look at."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import sys

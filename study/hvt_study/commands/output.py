@@ -1,7 +1,5 @@
 """The output of commands: on the terminal, also while they work, and in ``--out``."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -9,7 +7,6 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self
 
 from rich.console import Console
@@ -150,9 +147,7 @@ class RunProgress:
             self._first_line.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._first_line.cancel()
         if self._console.is_terminal:
             self._bar.stop()

@@ -1,7 +1,5 @@
 """``hvt-study plan``: how many runs, bytes and hours a study would take."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import time
@@ -11,14 +9,7 @@ from tempfile import TemporaryDirectory
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import print_table
-from hvt_study.commands.arguments import (
-    add_plan_arguments,
-    add_pool_arguments,
-    jobs_of,
-    open_sequences,
-    option,
-    study_plan,
-)
+from hvt_study.commands import arguments as common
 from hvt_study.datasets.sequence import Sequence, staged_bytes
 from hvt_study.matrix.plan import StudyPlan, first_runs
 from hvt_study.runs.execute import run_spec
@@ -112,16 +103,16 @@ _MANY_JOBS = 16
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Those of ``run``, so that one line can be both."""
-    add_plan_arguments(parser, writes=False)
-    option(parser, "--accounting", default="span")
-    add_pool_arguments(parser)
+    common.add_plan_arguments(parser, writes=False)
+    common.option(parser, "--accounting", default="span")
+    common.add_pool_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure a frame, count, print. Nothing is written."""
-    jobs = [jobs_of(arguments)] if hasattr(arguments, "jobs") else [1, os.cpu_count() or 1, _MANY_JOBS]
-    sequences = open_sequences(arguments)
-    plan = study_plan(arguments, sequences)
+    jobs = [common.jobs_of(arguments)] if hasattr(arguments, "jobs") else [1, os.cpu_count() or 1, _MANY_JOBS]
+    sequences = common.open_sequences(arguments)
+    plan = common.study_plan(arguments, sequences)
     frame_s = time_of_a_frame(plan)
     found = estimate(plan, tuple(sequence for _, sequence in sequences), frame_s=frame_s)
     print_table("The study", _lines(found, frame_s=frame_s, jobs=tuple(dict.fromkeys(jobs))))

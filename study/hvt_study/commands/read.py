@@ -1,7 +1,5 @@
 """``hvt-study read``: which codes on roofs can be read at the ground, and how soon, for the same bits?"""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,16 +11,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.runtime.reporting import write_json
 from hvt_common.values import Image
+from hvt_study.commands import output
 from hvt_study.commands.arguments import base_size, check_means, flown_frames, option, parse_rates
-from hvt_study.commands.output import (
-    RunProgress,
-    check_out,
-    decimals,
-    print_columns,
-    print_lines,
-    share,
-    writing,
-)
 from hvt_study.reading.compared import READ_METHODS, ReadPlan, ReadResult, ReadRow, compare_codes
 from hvt_study.reading.observer import Channel
 from hvt_study.reading.score import Evidence
@@ -61,12 +51,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Fly, read, print the table, write it and a sheet of examples."""
     check_means(arguments)
     plan = _plan(arguments)
-    file = check_out(arguments.out, name="read.json")
-    with RunProgress("flights") as progress:
+    file = output.check_out(arguments.out, name="read.json")
+    with output.RunProgress("flights") as progress:
         result = compare_codes(plan, on_flight=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0][2]}")
-    with writing(arguments.out):
+    with output.writing(arguments.out):
         write_json(file, [row.figures() for row in result.rows])
         write_sheet(arguments.out / "read.png", result)
     print_result(result)
@@ -74,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def print_result(result: ReadResult) -> None:
-    print_columns(
+    output.print_columns(
         f"{len(result.rows[0].codes())} codes, read by {result.reader}",
         _HEADS,
         map(_cells, result.rows),
@@ -83,7 +73,7 @@ def print_result(result: ReadResult) -> None:
         caption=_CAPTION,
     )
     for rate_kbps, method, reason in result.missing:
-        print_lines(f"{method} at {rate_kbps:g} kbps: not available, {reason}")
+        output.print_lines(f"{method} at {rate_kbps:g} kbps: not available, {reason}")
 
 
 def _cells(row: ReadRow) -> tuple[str, ...]:
@@ -98,12 +88,12 @@ def _cells(row: ReadRow) -> tuple[str, ...]:
         "; ".join(dict.fromkeys(streams)),
         f"{row.mean('total_bps') / 1e3:.0f}" if linked else "",
         f"{row.mean('roi_bps') / 1e3:.0f}" if linked else "",
-        share(row.score("base").read, 2),
-        share(row.score("stills").read, 2) if row.mean("roi_bps") else "",
-        share(every.read, 2),
-        *(share(one.read, 2) for one in heights),
-        decimals(every.median_s, 1),
-        share(every.misread, 2),
+        output.share(row.score("base").read, 2),
+        output.share(row.score("stills").read, 2) if row.mean("roi_bps") else "",
+        output.share(every.read, 2),
+        *(output.share(one.read, 2) for one in heights),
+        output.decimals(every.median_s, 1),
+        output.share(every.misread, 2),
     )
 
 

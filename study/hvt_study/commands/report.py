@@ -1,7 +1,5 @@
 """``hvt-study report``: the pages and figures of a study, made again from its table."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

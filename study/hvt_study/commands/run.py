@@ -1,7 +1,5 @@
 """``hvt-study run``: every method at every budget on every sequence, at matched totals; table and report."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 from contextlib import suppress
@@ -9,14 +7,7 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
-from hvt_study.commands.arguments import (
-    add_plan_arguments,
-    add_pool_arguments,
-    open_pool,
-    open_sequences,
-    option,
-    study_plan,
-)
+from hvt_study.commands import arguments as common
 from hvt_study.commands.output import RunProgress, check_out, writing
 from hvt_study.matrix.plan import RunRow, StudyPlan, check_parameters, first_runs, in_order, run_all, staying
 from hvt_study.metrics.bits import in_accounting
@@ -29,9 +20,9 @@ from hvt_study.runs.execute import runner
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The plan to compare, and where it is done and written."""
-    add_plan_arguments(parser)
-    option(parser, "--accounting", default="span")
-    add_pool_arguments(parser)
+    common.add_plan_arguments(parser)
+    common.option(parser, "--accounting", default="span")
+    common.add_pool_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -44,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     run failed.
     """
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    plan = study_plan(arguments, open_sequences(arguments))
+    plan = common.study_plan(arguments, common.open_sequences(arguments))
     table = check_out(arguments.out, name=RESULTS)
     check_parameters(plan, _earlier(table), out=arguments.out)
     rows = _flown(plan, arguments, table)
@@ -85,7 +76,7 @@ def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> in
 
 def _flown(plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> list[RunRow]:
     done: list[RunRow] = []
-    pool, at_once = open_pool(arguments)
+    pool, at_once = common.open_pool(arguments)
     progress = RunProgress("runs")
 
     def on_row(row: RunRow, count: int, of: int) -> None:

@@ -1,7 +1,5 @@
 """``hvt-study score``: tables of tracks against ground truth, side by side."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """``hvt-study sweep``: the pilot's selector table, for a clip or for detections from anywhere."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import io

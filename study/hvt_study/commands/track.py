@@ -1,7 +1,5 @@
 """``hvt-study track``: the tracker alone, over a file of detections, to compare it with others."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Callable, Iterator

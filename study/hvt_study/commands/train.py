@@ -1,7 +1,5 @@
 """``hvt-study train``: the embedded detector learns a user's own objects from his labelled pictures."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

@@ -1,7 +1,5 @@
 """``hvt-study tune``: better weights for a method, judged on sequences that the search has not seen."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,15 +13,7 @@ import optuna
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
 from hvt_edge.stills.policy.registry import METHODS
-from hvt_study.commands.arguments import (
-    add_plan_arguments,
-    add_pool_arguments,
-    check_whole,
-    names_of,
-    open_pool,
-    open_sequences,
-    study_plan,
-)
+from hvt_study.commands import arguments as common
 from hvt_study.commands.output import RunProgress, check_out, print_columns, print_lines, writing
 from hvt_study.matrix.plan import StudyPlan, spec_of
 from hvt_study.matrix.tuning import tuning_texts
@@ -195,8 +185,8 @@ _HIGHEST_SEED = 2**32 - 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_plan_arguments(parser, methods=False)
-    add_pool_arguments(parser)
+    common.add_plan_arguments(parser, methods=False)
+    common.add_pool_arguments(parser)
     parser.add_argument("--method", required=True, help="method to tune, such as M5")
     add = parser.add_argument
     add("--parameters", default="", metavar="NAME,…", help="which of its parameters (default: all)")
@@ -212,18 +202,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    check_whole("--trials", arguments.trials, 1, _MOST_TRIALS)
-    check_whole("--seed", arguments.seed, 0, _HIGHEST_SEED)
-    parameters = tunable(arguments.method, names_of(arguments.parameters))
-    sequences = open_sequences(arguments)
-    plan = study_plan(arguments, sequences)
+    common.check_whole("--trials", arguments.trials, 1, _MOST_TRIALS)
+    common.check_whole("--seed", arguments.seed, 0, _HIGHEST_SEED)
+    parameters = tunable(arguments.method, common.names_of(arguments.parameters))
+    sequences = common.open_sequences(arguments)
+    plan = common.study_plan(arguments, sequences)
     if len(plan.still_codecs) > 1:
         raise UserError(
             f"--still-codecs {arguments.still_codecs} are several: parameters are searched for one, name it"
         )
     train, held_out = split(plan.sequences, held_out=arguments.held_out)
     written = check_out(arguments.out, name="tune.json")
-    pool, _ = open_pool(arguments)
+    pool, _ = common.open_pool(arguments)
     progress = RunProgress(f"{arguments.method}, trials")
 
     def on_trial(number: int, worth: float, best: float) -> None:

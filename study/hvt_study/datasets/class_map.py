@@ -5,8 +5,6 @@ and ``people``, an ImageNet ``pickup`` of UAVDT's ``truck``. Within one kind nam
 have the very same ones, else they become one word. Where a dataset has one class of a kind, that is the word.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass

@@ -11,8 +11,6 @@
     annotations/*.json, labels.json, result.json, …           COCO, as CVAT, FiftyOne, Label Studio, Roboflow write it
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

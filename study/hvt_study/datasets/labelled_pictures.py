@@ -5,8 +5,6 @@ that was turned by its EXIF tag is read as it was labelled, of one that was resi
 else is refused.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter
@@ -19,27 +17,8 @@ from urllib.parse import unquote
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_edge.source.folder import sequence_files
+from hvt_study.datasets import label_files
 from hvt_study.datasets.annotation_rows import LARGEST, label_text
-from hvt_study.datasets.label_files import (
-    LOOKED_IN,
-    YAML,
-    YOLO_COLUMNS,
-    Folders,
-    VocFile,
-    check_strange,
-    class_file,
-    coco_files,
-    in_any_case,
-    keypoint_columns,
-    label_file,
-    number_of,
-    pictures_below,
-    read_class_file,
-    read_voc,
-    read_yolo,
-    yaml_folders,
-    yolo_names,
-)
 from hvt_study.datasets.label_table import image_labels
 from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts, check_pixels
 from hvt_study.datasets.layouts.mot import open_mot
@@ -60,7 +39,7 @@ class LabelledPicture:
     """A picture and where its labels are."""
 
     path: Path
-    labels: Path | tuple[Mapping[str, Any], ...] | VocFile | FrameLabels | None
+    labels: Path | tuple[Mapping[str, Any], ...] | label_files.VocFile | FrameLabels | None
     """A YOLO or VisDrone file, COCO's annotations of the picture, the labels themselves; None: nobody labelled it."""
     class_names: Sequence[str]
     visdrone: bool = False
@@ -75,7 +54,7 @@ class LabelledPicture:
     @property
     def unreadable(self) -> str:
         """Why there is no picture, in words."""
-        there = Folders().find(self.path) is not None
+        there = label_files.Folders().find(self.path) is not None
         return f"{self.path} {'cannot be read as a picture' if there else 'does not exist'}"
 
     def read(self, size: tuple[int, int]) -> FrameLabels | None:
@@ -90,10 +69,12 @@ class LabelledPicture:
         if isinstance(self.labels, Path):
             if self.visdrone:
                 return image_labels(self.labels, size)
-            return read_yolo(self.labels, self.class_names, size, self.doubts, keypoints=self.keypoints)
+            return label_files.read_yolo(
+                self.labels, self.class_names, size, self.doubts, keypoints=self.keypoints
+            )
         scale = self._scale(size)
         rows: list[_Annotation]
-        if isinstance(self.labels, VocFile):
+        if isinstance(self.labels, label_files.VocFile):
             rows = [(name, box, f"{self.path}, object {name}") for name, box in self.labels.objects]
         else:
             rows = [_coco_row(row) for row in self.labels]
@@ -133,22 +114,24 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     doubts = LabelDoubts()
     if place.suffix == ".json" and place.is_file():
         return _coco_pictures(place, doubts)
-    if place.suffix in YAML and place.is_file():
+    if place.suffix in label_files.YAML and place.is_file():
         return _of_yaml(place, classes)
     if place.is_file():
         return [LabelledPicture(place, None, ())]
     if not place.is_dir():
         raise UserError(f"{place} does not exist; a picture, a folder of pictures or a COCO file is expected")
-    if in_any_case(place / _TRUTH).is_file():
+    if label_files.in_any_case(place / _TRUTH).is_file():
         return _mot_pictures(place)
-    files = pictures_below(place)
+    files = label_files.pictures_below(place)
     if not files:
         raise UserError(f"{place} holds no pictures, nor do its folders")
-    folders = Folders()
-    found = {file: labels for file in files if (labels := label_file(file, place, folders)) is not None}
+    folders = label_files.Folders()
+    found = {
+        file: labels for file in files if (labels := label_files.label_file(file, place, folders)) is not None
+    }
     if not found:
         return _coco_beside(place, files, doubts)
-    voc = {file: read_voc(path) for file, path in found.items() if path.suffix.lower() == ".xml"}
+    voc = {file: label_files.read_voc(path) for file, path in found.items() if path.suffix.lower() == ".xml"}
     texts = [path for path in found.values() if path.suffix.lower() == ".txt"]
     visdrone = bool(texts) and _has_commas(texts)
     names: Sequence[str] = VISDRONE_NAMES if visdrone else ()
@@ -158,8 +141,8 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
         named = {name for one in voc.values() for name, _ in one.objects}
         names = tuple(sorted(name for name in named if name and name.casefold() not in IGNORED))
     elif texts and not visdrone:
-        names = yolo_names(place, classes, files)
-        keypoints = keypoint_columns(class_file(place, files))
+        names = label_files.yolo_names(place, classes, files)
+        keypoints = label_files.keypoint_columns(label_files.class_file(place, files))
     return [
         LabelledPicture(
             file,
@@ -175,9 +158,9 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
 
 
 def _of_yaml(path: Path, classes: Sequence[str] | None) -> list[LabelledPicture]:
-    folders = yaml_folders(path)
+    folders = label_files.yaml_folders(path)
     if classes is None and folders != [path.parent]:
-        classes = read_class_file(path)
+        classes = label_files.read_class_file(path)
     return [one for folder in folders for one in find_pictures(folder, classes=classes)]
 
 
@@ -195,17 +178,19 @@ def _has_commas(texts: Sequence[Path]) -> bool:
     if first is None:
         return texts[0].parent.name.lower() == "annotations"
     words = first.split()
-    return "," in first and not (len(words) >= YOLO_COLUMNS and not any("," in one[-1] for one in words))
+    return "," in first and not (
+        len(words) >= label_files.YOLO_COLUMNS and not any("," in one[-1] for one in words)
+    )
 
 
 def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> list[LabelledPicture]:
-    found = [one for path in coco_files(place) for one in _coco_pictures(path, doubts)]
+    found = [one for path in label_files.coco_files(place) for one in _coco_pictures(path, doubts)]
     if found:
         return found
     if any((place / folder).is_dir() for folder in ("labels", "annotations", "Annotations")):
         some = f"any of its {len(files)} pictures, such as {files[0].name}"
-        raise UserError(f"{place} has no label of {some}: looked in {LOOKED_IN}")
-    check_strange(place, files)
+        raise UserError(f"{place} has no label of {some}: looked in {label_files.LOOKED_IN}")
+    label_files.check_strange(place, files)
     return [LabelledPicture(file, None, ()) for file in files]
 
 
@@ -243,7 +228,7 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
         )
         raise UserError(f"{path} is not COCO's JSON: {why}") from None
     check_pixels(path, [side for row in rows for side in row.get("bbox") or () if _is_number(side)])
-    folders = Folders()
+    folders = label_files.Folders()
     pictures: dict[Path, tuple[str, Any, tuple[int, int] | None]] = {}
     unclear = {key for key, count in Counter(key for key, _, _ in images).items() if count > 1}
     for key, name, size in images:
@@ -280,7 +265,7 @@ def _id(value: Any) -> Any:
 
 
 def _said_size(image: Mapping[str, Any]) -> tuple[int, int] | None:
-    wide, high = (int(number_of(str(image.get(side)))) for side in ("width", "height"))
+    wide, high = (int(label_files.number_of(str(image.get(side)))) for side in ("width", "height"))
     return (wide, high) if min(wide, high) > 0 else None
 
 
@@ -306,7 +291,7 @@ def _mot_pictures(place: Path) -> list[LabelledPicture]:
     ]
 
 
-def _beside(path: Path, name: str, folders: Folders) -> Path:
+def _beside(path: Path, name: str, folders: label_files.Folders) -> Path:
     """Where a picture of COCO's file lies: beside it, in images/ or data/, or in a folder of the split.
 
     ::

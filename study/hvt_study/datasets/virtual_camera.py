@@ -56,8 +56,6 @@ _ACROSS, _DOWN = range(-3, 4), range(-2, 3)
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """How a camera flies."""
-
     heading: tuple[float, float] = (-1.0, 0.0)
     """Direction of length 1, to the picture's right and towards its bottom."""
     climb: float = 0.08

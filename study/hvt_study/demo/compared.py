@@ -1,7 +1,5 @@
 """Flights over the drawn scene, compared with the scene's exact truth, and by the codes read in them."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -122,22 +120,23 @@ class Legible:
         return self.video | self.stills.keys()
 
 
-def read_codes_of(
-    flown: Flown,
-    codes: Mapping[int, Code],
-    views: Sequence[Sequence[CodeInView]],
-    *,
-    base_per_source: float,
-    reader: CodeReader,
-) -> Legible:
+@dataclass(frozen=True, slots=True)
+class Painted:
+    """The codes of the scene that all flights saw."""
+
+    codes: Mapping[int, Code]
+    """By object."""
+    views: Sequence[Sequence[CodeInView]]
+    """By frame, from 0."""
+    base_per_source: float
+
+
+def read_codes_of(flown: Flown, painted: Painted, reader: CodeReader) -> Legible:
     """Read every still that holds a whole code, and each code in some base pictures."""
-    video = {
-        object_id
-        for object_id, code in codes.items()
-        if _in_video(flown, code, views, base_per_source=base_per_source, reader=reader)
-    }
+    codes = painted.codes
+    video = {one for one, code in codes.items() if _in_video(flown, code, painted, reader)}
     read: dict[int, Shown] = {}
-    for shown in stills_with_codes(flown, codes, views, base_per_source=base_per_source):
+    for shown in stills_with_codes(flown, painted):
         if shown.object_id not in read:
             crop = code_crop(shown.still.image_bgr, _in_still(shown.still, shown.box_base_px))
             (reading,) = reader.read([crop])
@@ -146,19 +145,13 @@ def read_codes_of(
     return Legible(frozenset(video), read)
 
 
-def stills_with_codes(
-    flown: Flown,
-    codes: Mapping[int, Code],
-    views: Sequence[Sequence[CodeInView]],
-    *,
-    base_per_source: float,
-) -> Iterator[Shown]:
+def stills_with_codes(flown: Flown, painted: Painted) -> Iterator[Shown]:
     """Every still with each code that lies whole in it."""
     for still in flown.stills:
         place = np.array(still.place_base_px)
-        for one in views[still.frame - 1]:
-            box, whole = one.box_source_px * base_per_source, one.visible >= LEAST_VISIBLE
-            if whole and one.object_id in codes and share_inside(box, place) >= INSIDE_SHARE:
+        for one in painted.views[still.frame - 1]:
+            box, whole = one.box_source_px * painted.base_per_source, one.visible >= LEAST_VISIBLE
+            if whole and one.object_id in painted.codes and share_inside(box, place) >= INSIDE_SHARE:
                 x1, y1, x2, y2 = box.tolist()
                 yield Shown(one.object_id, still, (x1, y1, x2, y2))
 
@@ -172,23 +165,16 @@ def code_pictures(shown: Shown, base: Image) -> tuple[Image, Image]:
     return code_crop(base, wide), code_crop(shown.still.image_bgr, _in_still(shown.still, wide))
 
 
-def _in_video(
-    flown: Flown,
-    code: Code,
-    views: Sequence[Sequence[CodeInView]],
-    *,
-    base_per_source: float,
-    reader: CodeReader,
-) -> bool:
+def _in_video(flown: Flown, code: Code, painted: Painted, reader: CodeReader) -> bool:
     places = [
         (frame, one)
         for frame in flown.pictures
-        for one in views[frame - 1]
+        for one in painted.views[frame - 1]
         if one.object_id == code.object_id and one.visible >= LEAST_VISIBLE
     ]
     some = np.linspace(0, len(places) - 1, min(_SOME_PICTURES, len(places))).round().astype(int)
     for frame, one in (places[number] for number in some.tolist()):
-        crop = code_crop(flown.pictures[frame], (one.box_source_px * base_per_source).tolist())
+        crop = code_crop(flown.pictures[frame], (one.box_source_px * painted.base_per_source).tolist())
         if reader.read([crop])[0].text == code.text:
             return True
     return False
@@ -211,16 +197,13 @@ class Compared:
     scores: tuple[ClassScore, ...]
     legible: tuple[Legible, ...] | None
     """None where no reader is installed."""
-    codes: Mapping[int, Code]
+    painted: Painted
     truth: Mapping[int, FrameLabels]
     """By frame, from 1; base pixels."""
-    views: Sequence[Sequence[CodeInView]]
-    """By frame, from 0."""
-    base_per_source: float
 
     def panels(self) -> list[Panel]:
         """The middle of the flight as each shows it."""
-        frame = (len(self.views) + 1) // 2
+        frame = (len(self.painted.views) + 1) // 2
         return [
             Panel(
                 f"{one.name}: named F1 {figures.named_f1:.3f}",
@@ -238,12 +221,12 @@ class Compared:
         if self.legible is not None and self.legible[-1].stills:
             shown = list(self.legible[-1].stills.values())
         else:
-            every = stills_with_codes(last, self.codes, self.views, base_per_source=self.base_per_source)
-            shown = list({one.object_id: one for one in every}.values())
-        shown.sort(key=lambda one: (one.object_id in known, self.codes[one.object_id].height_px))
+            shown = list({one.object_id: one for one in stills_with_codes(last, self.painted)}.values())
+        codes = self.painted.codes
+        shown.sort(key=lambda one: (one.object_id in known, codes[one.object_id].height_px))
         pairs = []
         for one in shown[:_PAIRS]:
-            code = self.codes[one.object_id].text
+            code = codes[one.object_id].text
             left, right = code_pictures(one, _newest(video, one.still.frame))
             if self.legible is None:
                 words = f"video of {video.name}", f"still; painted: {code}"
@@ -269,17 +252,12 @@ def compare_flown(folder: Path, names: Sequence[str], *, seed: int, with_reader:
     frames = range(max(max(one.pictures) for one in flown))
     truth = {index + 1: _scaled(scene.labels(index), scale) for index in frames}
     views = [scene.codes(index) for index in frames]
-    codes = codes_to_read(views)
-
-    def read(one: Flown) -> Legible:
-        return read_codes_of(one, codes, views, base_per_source=scale, reader=CodeReader())
-
-    legible = None
+    painted, legible = Painted(codes_to_read(views), views, scale), None
     if with_reader:
         with ThreadPoolExecutor(len(flown)) as pool:  # the networks let other threads run
-            legible = tuple(pool.map(read, flown))
+            legible = tuple(pool.map(lambda one: read_codes_of(one, painted, CodeReader()), flown))
     scores = tuple(score(one.tracks, truth, frame_area_px=wide * high) for one in flown)
-    return Compared(flown, scores, legible, codes, truth, views, scale)
+    return Compared(flown, scores, legible, painted, truth)
 
 
 def _scaled(labels: FrameLabels, scale: float) -> FrameLabels:

@@ -1,7 +1,5 @@
 """One picture of several flights: the same place and instant in each, and the gain of stills."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

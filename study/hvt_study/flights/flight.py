@@ -39,16 +39,8 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
 from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, FrameSource
+from hvt_study.flights import flight_link
 from hvt_study.flights.flight_ground import GroundSide, InlineExecutor
-from hvt_study.flights.flight_link import (
-    START_NS,
-    FlightInbox,
-    FlightOutlet,
-    LinkReport,
-    MediaClock,
-    SerialLink,
-    frame_ns,
-)
 from hvt_study.metrics.observed import ObservedFrame
 
 _SESSION = 1 << 31  # as many bytes on the wire as a random one
@@ -76,7 +68,7 @@ class FlightReport:
     """By row of the key table: payload, attachment and transport."""
     messages: Mapping[str, int]
     max_frame_bytes: int
-    link: LinkReport
+    link: flight_link.LinkReport
     """Its delays are those of the base stream, from capture to arrival."""
     picture_age_p95_ms: float
     """How old the newest picture at the ground is, seen at every frame."""
@@ -108,7 +100,7 @@ def coded_frames(frames: int, fps: float) -> frozenset[int]:
 def picture_age_p95_ms(shown_ns: Sequence[tuple[int, int]], frames: int) -> float:
     """Age of the newest of the pictures, (arrival, capture), at each of ``frames`` from the first picture on."""
     shown = np.array(shown_ns, np.int64).reshape(-1, 2)
-    at_ns = np.array([frame_ns(frame_index) for frame_index in range(frames)], np.int64)
+    at_ns = np.array([flight_link.frame_ns(frame_index) for frame_index in range(frames)], np.int64)
     at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]
     newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
     return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else 0.0
@@ -167,7 +159,7 @@ class _FlightWorld(World):
         self._flight = flight
         self._detector = detector
         self.session_id = _SESSION
-        self.clock = MediaClock()
+        self.clock = flight_link.MediaClock()
         self.inbox = flight.inbox
         self.executor = InlineExecutor()
 
@@ -196,13 +188,15 @@ class Flight:
         plan: FlightPlan,
         *,
         detector: Detector,
-        make_ground: Callable[[Info, SerialLink[Received]], Any],
+        make_ground: Callable[[Info, flight_link.SerialLink[Received]], Any],
     ) -> None:
         self.plan = plan
-        self.inbox = FlightInbox()
-        self._link: SerialLink[Received] = SerialLink(rate_bps=plan.link_bps)
+        self.inbox = flight_link.FlightInbox()
+        self._link: flight_link.SerialLink[Received] = flight_link.SerialLink(rate_bps=plan.link_bps)
         self._make_ground = make_ground
-        self.outlet = FlightOutlet(self._link, edge_id=plan.edge.edge_id, on_listen=self._open_ground)
+        self.outlet = flight_link.FlightOutlet(
+            self._link, edge_id=plan.edge.edge_id, on_listen=self._open_ground
+        )
         self._edge = Edge(
             replace(plan.edge, quiet=True), stop=threading.Event(), world=_FlightWorld(self, detector)
         )
@@ -230,7 +224,7 @@ class Flight:
             line_bytes=dict(outlet.line_bytes),
             messages=dict(outlet.messages),
             max_frame_bytes=outlet.max_frame_bytes,
-            link=LinkReport.of(self.ground.base_delays_ns, self.ground.arrivals),
+            link=flight_link.LinkReport.of(self.ground.base_delays_ns, self.ground.arrivals),
             picture_age_p95_ms=picture_age_p95_ms(self.ground.shown_ns, frames),
             edge_cpu_ms=1e3 * (self._cpu_s + saved_cpu_s) / frames,
             digest=outlet.digest,
@@ -256,20 +250,20 @@ class Flight:
         self.ground.detected.clear()
 
     def _open_ground(self, answer: bytes) -> None:
-        info = replace(Info.parse(answer), fps=NOMINAL_FPS, started_ns=START_NS)
+        info = replace(Info.parse(answer), fps=NOMINAL_FPS, started_ns=flight_link.START_NS)
         self.ground = self._make_ground(info, self._link)
 
     def _pass_over(self, until_frame: int) -> None:
         """The source did not give the frames before this one."""
         for frame_index in range(self._next_frame, until_frame):
-            self.ground.pass_over(frame_index, capture_ns=frame_ns(frame_index))
+            self.ground.pass_over(frame_index, capture_ns=flight_link.frame_ns(frame_index))
         self._next_frame = max(self._next_frame, until_frame)
 
 
 class _NoGround:
     """A ground that takes all messages and analyzes nothing."""
 
-    def __init__(self, link: SerialLink[Received]) -> None:
+    def __init__(self, link: flight_link.SerialLink[Received]) -> None:
         self._link = link
         self.results: deque[tuple[int, StillResult]] = deque()
         self.detected: deque[tuple[int, Detected]] = deque()

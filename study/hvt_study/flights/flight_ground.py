@@ -1,7 +1,5 @@
 """The ground's end of a flight: takes messages when the link delivers them, and keeps the list of every frame."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable
@@ -10,19 +8,9 @@ from typing import Any, TypeVar
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector
+from hvt_common.protocol import messages as wire
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys, parse_key
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_common.protocol.messages import (
-    MAX_STILL_RESULTS,
-    BaseHeader,
-    CaptureTimes,
-    Feedback,
-    Info,
-    RoiHeader,
-    Status,
-    StillResult,
-    TrackStep,
-)
 from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
@@ -111,7 +99,7 @@ class GroundSide:
 
     def __init__(
         self,
-        info: Info,
+        info: wire.Info,
         *,
         config: GroundConfig,
         models: Models,
@@ -119,7 +107,7 @@ class GroundSide:
     ) -> None:
         self._link = link
         self._info = info
-        self._captures = CaptureTimes()
+        self._captures = wire.CaptureTimes()
         self.now_ns = info.started_ns
         detector, classifier = models.take()
         perception = SessionPerception(config, SharedModels(detector, classifier, config=config), info)
@@ -142,7 +130,7 @@ class GroundSide:
         """By how much the newest picture came after its capture."""
         self._uncoded: deque[tuple[int, int]] = deque()
         self.lists: dict[int, ObservedFrame] = {}
-        self.results: deque[tuple[int, StillResult]] = deque()
+        self.results: deque[tuple[int, wire.StillResult]] = deque()
         """Answers to the edge, with the time at which it hears them."""
         self.detected: deque[tuple[int, Detected]] = deque()
         self.back_bytes = 0
@@ -187,36 +175,36 @@ class GroundSide:
         item = arrival.message
         row = (parse_key(item.key) or ("", None))[1]
         if row is Channel.BASE:
-            base = BaseHeader.parse(item.attachment, item.payload)
+            base = wire.BaseHeader.parse(item.attachment, item.payload)
             self._captures.note(base)
             self._picture(base, arrival)
         elif row is Channel.ROI:
-            header = RoiHeader.parse(item.attachment, item.payload)
+            header = wire.RoiHeader.parse(item.attachment, item.payload)
             header = self._captures.filled(header, otherwise_ns=arrival.arrival_ns - header.send_delay_ns)
             header = header.named(self._info.class_names)
             self._record.still(header, arrival)
             self._session.take(header, item)
         elif row is Channel.TRACKS:
-            self._session.take(TrackStep.parse(item.payload), item)
+            self._session.take(wire.TrackStep.parse(item.payload), item)
         elif row is Channel.STATUS:
-            self._session.take(Status.parse(item.payload), item)
+            self._session.take(wire.Status.parse(item.payload), item)
 
     def _answer(self, last: Arrival[Received]) -> None:
         """The answers of the ground go back in the time that the newest message took to come."""
         back_ns = self.now_ns + (last.arrival_ns - last.enter_ns)
         results = self._session.reception.take_results(_MOST_RESULTS)
         self._record.answers(results)
-        for first in range(0, len(results), MAX_STILL_RESULTS):
-            self.back_bytes += self._weight(results[first : first + MAX_STILL_RESULTS])
+        for first in range(0, len(results), wire.MAX_STILL_RESULTS):
+            self.back_bytes += self._weight(results[first : first + wire.MAX_STILL_RESULTS])
         self.results.extend((back_ns, one) for one in results)
         objects = self._session.pipeline.objects_detected
         if objects >= 0:
             self.detected.append((back_ns, Detected(_RECEIVER, self._session.reception.analyzed[0], objects)))
 
-    def _weight(self, results: tuple[StillResult, ...]) -> int:
+    def _weight(self, results: tuple[wire.StillResult, ...]) -> int:
         """Line bytes of a report with these, as `hvt_ground.session.edge_port` would send it."""
         frames, stills = self._session.reception.frames, self._session.reception.stills
-        payload = Feedback(
+        payload = wire.Feedback(
             session_id=self._info.session_id,
             receiver_id=_RECEIVER,
             sequence=frames,
@@ -242,7 +230,7 @@ class GroundSide:
         key, encoding = EdgeKeys(self._info.edge)[Channel.FEEDBACK], DELIVERIES[Channel.FEEDBACK].encoding
         return len(payload) + overhead_bytes(len(payload), 0, key=key, encoding=encoding)
 
-    def _picture(self, header: BaseHeader, arrival: Arrival[Received]) -> None:
+    def _picture(self, header: wire.BaseHeader, arrival: Arrival[Received]) -> None:
         while self._uncoded and self._uncoded[0][0] < header.frame_index:
             self._take_list(self._uncoded.popleft()[0], at_ns=arrival.arrival_ns)
         self._behind_ns = arrival.arrival_ns - header.capture_ns

@@ -4,8 +4,6 @@
 answer. Nothing here changes what is shown or sent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -65,8 +63,6 @@ class Watch:
 
 @dataclass(frozen=True, slots=True)
 class _Pending:
-    """Waits for the next list."""
-
     done: RefinedObject
     frame_index: int
     edge_track_id: int

@@ -5,8 +5,6 @@ are exact where the source knows its objects (the demo, an annotated picture und
 *reference* labels (`hvt_study.datasets.reference`).
 """
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping

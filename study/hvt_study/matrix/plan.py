@@ -10,8 +10,6 @@ A pool is anything with ``submit``: processes of this machine, or the workers of
 in the cache; a study that was killed and is started again takes it from there.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -4,8 +4,6 @@ A flight of one method takes up to ten times as long as that of another: how fas
 those to come. But other programs, which make one slower than earlier ones of its kind, make all slower.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections import Counter
 from collections.abc import Hashable, Mapping

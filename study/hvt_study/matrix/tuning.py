@@ -1,7 +1,5 @@
 """Parameters of methods other than their defaults, as ``--tune`` of ``hvt-study run`` names them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path

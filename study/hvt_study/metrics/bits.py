@@ -5,8 +5,6 @@ span. The pilot's notebooks divided the bytes of the 300 frames that they proces
 the accounting ``pilot`` does the same, for comparison with its printed table and for nothing else.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeAlias, get_args

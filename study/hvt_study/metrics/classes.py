@@ -17,8 +17,6 @@ Kaplan-Meier estimate (Kaplan and Meier 1958), which leaves out neither the cens
 method that misses much) nor the time that they waited.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ a frame instead of 100, because aerial frames hold more; and ignored regions (se
 In a flight it is of base frames: those that the ground has decoded and detected on, not the list at every frame.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

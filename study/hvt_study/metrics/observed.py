@@ -17,8 +17,6 @@ small
     ``strict_small_only``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

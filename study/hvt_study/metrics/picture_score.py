@@ -6,8 +6,6 @@ pictures as Küppers et al. 2020 (https://arxiv.org/abs/2004.13546): boxes fall 
 confidence; the difference between mean confidence and share of right boxes of each bin, weighted by its boxes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -36,12 +34,10 @@ class OperatingPoint:
 
     @property
     def precision(self) -> float:
-        """Right boxes of all boxes."""
         return self.right / self.boxes if self.boxes else math.nan
 
     @property
     def recall(self) -> float:
-        """Right boxes of all labels."""
         return self.right / self.labels if self.labels else math.nan
 
     @property

@@ -12,8 +12,6 @@ Continuity says how steadily labelled objects are held. A gap is a run of an obj
 after it was found once; the time before is no gap: recall has it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

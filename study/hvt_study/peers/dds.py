@@ -11,8 +11,6 @@ of it stays within the budget in every rolling window, and over the clip: the la
 clip's end, is cut short where it would go beyond.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Generator, Sequence
 from contextlib import closing

@@ -1,7 +1,5 @@
 """The camera's end of the two-pass peer: codes every frame once, and requested regions a second time."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Sequence

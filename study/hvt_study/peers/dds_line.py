@@ -1,7 +1,5 @@
 """The line between both ends of the peer: every message is weighed, counted once and sent over a serial link."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from collections import Counter
@@ -59,7 +57,6 @@ class Line:
 
     @property
     def digest(self) -> str:
-        """Digest of all payloads so far."""
         return self._digest.hexdigest()
 
     @property

@@ -5,8 +5,6 @@ Video is matched to the hybrid that spent most at a rate, so that it never has f
 nobody could choose better.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -89,7 +87,6 @@ class ReadRow:
         return [self.score(channel, heights_px=edges) for edges in pairwise(_HEIGHT_EDGES_PX)]
 
     def mean(self, name: str) -> float:
-        """Mean of a figure of the flights."""
         return float(sum(getattr(one.flight, name) for one in self.scenes) / len(self.scenes))
 
     def _pooled(self, channel: Channel) -> list[tuple[Code, Evidence]]:

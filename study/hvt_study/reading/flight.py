@@ -1,7 +1,5 @@
 """One flight that is read: the edge and ground of the study with a reader beside them; cached, never flown twice."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -193,20 +191,14 @@ def _packed(flight: ReadFlight) -> dict[str, Any]:
 
 
 def _unpacked(known: Mapping[str, Any]) -> ReadFlight:
-    return ReadFlight(
-        size=(known["size"][0], known["size"][1]),
-        fps=known["fps"],
-        total_bps=known["total_bps"],
-        base_bps=known["base_bps"],
-        roi_bps=known["roi_bps"],
-        evidence={
-            channel: {
-                int(object_id): _unpacked_evidence(one)
-                for object_id, one in known["evidence"].get(channel, {}).items()
-            }
-            for channel in CHANNELS
-        },
-    )
+    evidence = {
+        channel: {
+            int(object_id): _unpacked_evidence(one)
+            for object_id, one in known["evidence"].get(channel, {}).items()
+        }
+        for channel in CHANNELS
+    }
+    return ReadFlight(**{**known, "size": tuple(known["size"]), "evidence": evidence})
 
 
 def _packed_evidence(one: Evidence) -> dict[str, Any]:

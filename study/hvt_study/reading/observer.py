@@ -4,8 +4,6 @@ Of the truth the reader gets one thing: the box around a code at the frame that 
 which way the code is turned, how many characters it has, or which ones may occur.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Literal

@@ -3,8 +3,6 @@
 It is RapidOCR's text recognition, a network of others that is given a small picture and nothing else.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence

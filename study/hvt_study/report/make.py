@@ -1,7 +1,5 @@
 """From rows to a report: the answer in a sentence, tables and figures in their order, words between."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 

@@ -1,7 +1,5 @@
 """Tables of a report: a row a method and regime, the matrix of one figure, pairs, and their notes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -60,8 +58,6 @@ _BENEATH = f"means over sequences, beneath the {INTERVALS}, and n where fewer th
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """One of the tables."""
-
     title: str
     says: str
     columns: Sequence[str]

@@ -4,8 +4,6 @@ The HTML page needs no other file: style, drawings and pictures are in it, and n
 takes the reader's light or dark, and prints on A4. The templates lie beside this file.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 import shutil

@@ -3,8 +3,6 @@
 `figures` makes those of a row, from a flight and its labels.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math
@@ -22,18 +20,11 @@ from hvt_common.protocol.channels import Channel
 from hvt_study.cache.results import FLIGHTS, CacheError, ResultCache, content_key
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.flights.flight import FlightReport
+from hvt_study.metrics import observed
 from hvt_study.metrics.bits import line_rates, still_counts
 from hvt_study.metrics.classes import class_score, first_correct
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.judged import Judged, judged
-from hvt_study.metrics.observed import (
-    arrivals,
-    detected_frames,
-    proxies,
-    refined_frames,
-    refined_objects,
-    still_delays_ms,
-)
 from hvt_study.metrics.tracking import continuity, tracking_score
 from hvt_study.runs.methods import METHODS
 from hvt_study.runs.run_context import Materials, RunContext, begin_study, open_materials, open_run_context
@@ -61,7 +52,7 @@ def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
         labelled = {name: value if name in _SAYS_OF_ONE else None for name, value in labelled.items()}
     found = {**_bits(report, context), **labelled, **_delays(report)}
     found |= {
-        **proxies(refined_objects(report.lists)),
+        **observed.proxies(observed.refined_objects(report.lists)),
         "digest": report.digest,
         "edge_cpu_ms": report.edge_cpu_ms,
     }
@@ -80,7 +71,9 @@ def _bits(report: FlightReport, context: RunContext) -> dict[str, Any]:
         "back_bps": round(8 * back_bytes / seconds),
         **{f"{name}_pilot": round(pilot[name]) for name in _RATES},
         "fps": report.messages.get("base", 0) / seconds,
-        **still_counts(arrivals(report.lists), refined_objects(report.lists), seconds=seconds),
+        **still_counts(
+            observed.arrivals(report.lists), observed.refined_objects(report.lists), seconds=seconds
+        ),
     }
 
 
@@ -88,8 +81,8 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
     words: dict[str, Any] = {"word": context.classes.word, "classes": context.classes.classes}
     if context.sequence.one_target:  # a box of any class finds it
         words["classes"] = None
-    frames = judged(refined_frames(report.lists, context.labels), **words)
-    detection = detection_score(judged(detected_frames(report.lists, context.labels), **words))
+    frames = judged(observed.refined_frames(report.lists, context.labels), **words)
+    detection = detection_score(judged(observed.detected_frames(report.lists, context.labels), **words))
     after, before = class_score(frames), class_score(frames, refined=False)
     tracking, held = tracking_score(frames), continuity(frames)
     first = first_correct(frames, fps=NOMINAL_FPS, shown_s=[one.shown_s for one in report.lists])
@@ -135,7 +128,7 @@ def _halves(frames: Sequence[Judged]) -> dict[str, float]:
 
 
 def _delays(report: FlightReport) -> dict[str, Any]:
-    still_p50_ms, still_p95_ms = still_delays_ms(arrivals(report.lists))
+    still_p50_ms, still_p95_ms = observed.still_delays_ms(observed.arrivals(report.lists))
     return {
         "delay_p50_ms": report.link.delay_p50_ms,
         "delay_p95_ms": report.link.delay_p95_ms,

@@ -1,7 +1,5 @@
 """The methods of a study: each as settings of the edge, and how its bits are matched with the others'."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum

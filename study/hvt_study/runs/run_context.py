@@ -4,8 +4,6 @@ A study that is started again asks for little more than its `Materials`, for whi
 need none.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import tempfile

@@ -1,7 +1,5 @@
 """A run's settings as users of ``hvt-edge`` and ``hvt-ground`` would give them, and its flight."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """One run of the matrix: everything that decides its result, where its files lie for a process, and its row."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -9,8 +9,6 @@ less than the one before it. A rate and size that are best together and far from
 every pair would cost three times as much.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

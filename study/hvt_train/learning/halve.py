@@ -1,7 +1,5 @@
 """Weights of an ONNX graph in half of their bytes; YOLOX's first layers as single convolutions, stripe by stripe."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper

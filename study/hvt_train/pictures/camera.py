@@ -5,8 +5,6 @@ neither way; the rest is ground. The best on such views is Open Model Zoo's pers
 (Apache-2.0); the others are YOLOX-nano, of the picture as it is and enlarged, and the aerial detector of before.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

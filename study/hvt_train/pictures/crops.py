@@ -1,7 +1,5 @@
 """Crops for the classifier: cut from untouched source frames as `hvt_edge.stills.maker.StillMaker` cuts them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The objects of a place: one function a class, each making a varied `Solid`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The classes of ``aerial-nano``, and the choices that a set may leave open."""
 
-from __future__ import annotations
-
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 
 CLASSES = (*CLASS_NAMES, "boat", "bicycle")

@@ -1,7 +1,5 @@
 """Who stands where in a place: car parks, roads, yards, buildings, clutter; nothing overlaps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

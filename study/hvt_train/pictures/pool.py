@@ -6,8 +6,6 @@ Six kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as 
 demo's own seed 0 never occur among them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -5,8 +5,6 @@ pool. ``class_ids`` beyond the classes: -1 is neither object nor background, `LA
 truck or bus: the set does not tell which.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable, Iterator

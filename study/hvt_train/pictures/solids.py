@@ -6,8 +6,6 @@ shape, paint and glass than any real car park. Body axes: x to the nose, y to th
 on the ground in the middle.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import pairwise
 

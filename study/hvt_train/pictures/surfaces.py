@@ -1,7 +1,5 @@
 """The ground of a place: materials, noise of several scales, markings, cracks, stains, and text laid over it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

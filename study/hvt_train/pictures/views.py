@@ -1,7 +1,5 @@
 """Training views: a random window of a pool picture at a random scale, damaged as cameras and codecs do it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a detector said of a picture, kept between flights."""
 
-from __future__ import annotations
-
 import shutil
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is kept between runs of the study."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -88,12 +86,10 @@ def test_content_decides_the_name(tmp_path):
         file_digest(tmp_path / "none")
 
 
-# HVT's own code is named by its content.
-
-
-def package(root, **files):
-    for name, text in {"__init__": "", "tracker": "iou = 0.3\n", **files}.items():
-        path = root / "mine" / f"{name.replace('__of__', '/')}.py"
+def package(root, tracker="iou = 0.3\n", page="a", **more):
+    """A package of two modules, or more, in folders of their own."""
+    for name, text in {"__init__": "", "tracker": tracker, "report/page": page, **more}.items():
+        path = root / "mine" / f"{name}.py"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     return root / "mine"
@@ -101,15 +97,12 @@ def package(root, **files):
 
 def test_an_edit_is_another_code(tmp_path):
     """The figures of the old tracker would stand in the new one's table."""
-    before = package(tmp_path / "before", report__of__page="a")
-    assert tree_digest([package(tmp_path / "copy", report__of__page="a")]) == tree_digest([before])
-    assert tree_digest(
-        [package(tmp_path / "edit", tracker="iou = 0.4\n", report__of__page="a")]
-    ) != tree_digest([before])
-    assert tree_digest([package(tmp_path / "more", other="", report__of__page="a")]) != tree_digest([before])
-    page = package(tmp_path / "page", report__of__page="b")
-    assert tree_digest([page]) != tree_digest([before])
-    assert tree_digest([page], without=["mine/report"]) == tree_digest([before], without=["mine/report"])
+    before = package(tmp_path / "before")
+    own = tree_digest([before])
+    assert tree_digest([package(tmp_path / "copy")]) == own
+    page = package(tmp_path / "page", page="b")
+    edits = (package(tmp_path / "edit", tracker="iou = 0.4\n"), package(tmp_path / "more", other=""), page)
+    assert own not in [tree_digest([edit]) for edit in edits]
     (before / "__pycache__").mkdir()
     shutil.copy(before / "tracker.py", before / "__pycache__" / "tracker.pyc")
     assert tree_digest([page], without=["mine/report"]) == tree_digest([before], without=["mine/report"])

@@ -1,7 +1,5 @@
 """``hvt-study compare`` as a user runs it."""
 
-from __future__ import annotations
-
 import json
 
 import cv2
@@ -66,10 +64,9 @@ def test_a_comparison_end_to_end(tmp_path, capsys, methods):
         assert list(row)[: len(FIRST_COLUMNS)] == FIRST_COLUMNS
         assert row["labels"] == "reference"
         assert 0 < row["named_f1"] <= row["f1"] <= 1
-        assert row["false_per_frame"] >= 0
         assert 0.3 * 300_000 < row["total_bps"] < 1.1 * 300_000
         assert row["total_bps"] > row["base_bps"] + row["roi_bps"]
-        assert row["edge_cpu_ms"] > 0
+        assert (row["false_per_frame"] >= 0, row["edge_cpu_ms"] > 0) == (True, True)
         assert (row["roi_bps"] > 0) == (row["method"] != "M0")
     assert (tmp_path / "compare.png").read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out
@@ -112,14 +109,10 @@ def test_every_method_is_settings_that_the_edge_takes(name):
 
 def test_names_of_methods():
     """A row of the comparison is a method of the study, and the plot knows how to draw it."""
-    assert all(
-        method in METHODS and METHODS[method].sends_stills == bool(codec)
-        for method, codec in COMPARED.values()
-    )
-    styles = [style_of(name) for name in COMPARED]
-    assert len({(style.colour, style.marker) for style in styles}) == len(COMPARED), (
-        "auto was drawn as M0-best"
-    )
+    pairs = COMPARED.values()
+    assert all(name in METHODS and METHODS[name].sends_stills == bool(codec) for name, codec in pairs)
+    styles = {(style.colour, style.marker) for style in map(style_of, COMPARED)}
+    assert len(styles) == len(COMPARED), "auto was drawn as M0-best"
 
 
 def test_a_plot_of_what_there_is(tmp_path):

@@ -1,7 +1,5 @@
 """``hvt-study detect``: files, figures and sheets of a detector over labelled pictures."""
 
-from __future__ import annotations
-
 import csv
 import json
 from functools import cache
@@ -30,7 +28,6 @@ def scene() -> Scene:
 
 @cache
 def moment(t_s: float) -> tuple[Image, Truth]:
-    """A picture and what is in it."""
     return scene().image(t_s), scene().truth(t_s)
 
 
@@ -52,7 +49,7 @@ def draw(folder: Path, *, moments: int = 2) -> Path:
     return folder
 
 
-def sentence(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def sentence(capsys, *arguments):
     """The last line on stderr of a call that must end with exit code 2."""
     assert main(["detect", *map(str, arguments), "--provider", "cpu"]) == 2
     captured = capsys.readouterr()
@@ -60,14 +57,14 @@ def sentence(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return captured.err.splitlines()[-1]
 
 
-def test_figures_files_and_sheets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_files_and_sheets(tmp_path, capsys):
     """The embedded detector on the scene it knows: found, scored, shown; an unreadable picture costs only itself."""
     folder, out = draw(tmp_path / "set"), tmp_path / "out"
     (folder / "images" / "broken.png").write_bytes(b"no picture")
     assert main(["detect", str(folder), "--provider", "cpu", "--vehicles-as-one", "--out", str(out)]) == 0
-    said = capsys.readouterr()
-    assert "broken.png cannot be read as a picture; skipped" in said.err
-    assert "1 of 3 pictures skipped" in said.err
+    said = capsys.readouterr().err
+    assert "broken.png cannot be read as a picture; skipped" in said
+    assert "1 of 3 pictures skipped" in said
     score = json.loads((out / "score.json").read_text())
     vehicle = score["by_class"]["vehicle"]
     assert score["pictures"] == 2
@@ -79,16 +76,15 @@ def test_figures_files_and_sheets(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert list(rows[0]) == ["file", "x1", "y1", "x2", "y2", "confidence", "class"]
     assert sum(Path(row["file"]).name == "0.png" for row in rows) > 5
     assert all(float(row["confidence"]) >= 0.25 and float(row["x2"]) <= 1280 for row in rows)
-    judged = [row for row in rows if row["class"] in CLASSES.split(",")]
-    assert score["boxes"] == len(judged)
+    assert score["boxes"] == sum(row["class"] in CLASSES.split(",") for row in rows)
     sheets = [
-        cv2.imread(str(path)) for path in (out / "false-alarms.png", out / "misses.png") if path.exists()
+        cv2.imread(str(out / name)) for name in ("false-alarms.png", "misses.png") if (out / name).exists()
     ]
     assert sheets
     assert all(sheet is not None and sheet.shape[1] == 8 * 150 for sheet in sheets)
 
 
-def test_classes_that_a_set_does_not_label_count_neither_way(tmp_path: Path) -> None:
+def test_classes_that_a_set_does_not_label_count_neither_way(tmp_path):
     """Minsk and Madison label no people: whoever sees them there is not wrong."""
     folder = draw(tmp_path / "set", moments=1)
     for path in (folder / "labels").glob("*.txt"):
@@ -98,7 +94,7 @@ def test_classes_that_a_set_does_not_label_count_neither_way(tmp_path: Path) -> 
     assert list(json.loads((tmp_path / "out/score.json").read_text())["by_class"]) == ["vehicle"]
 
 
-def test_coco_and_yolo_say_the_same(tmp_path: Path) -> None:
+def test_coco_and_yolo_say_the_same(tmp_path):
     """One set in two formats has one score."""
     folder = draw(tmp_path / "set", moments=1)
     names, wide, high = list(Scene.class_names), 1280, 720
@@ -107,11 +103,8 @@ def test_coco_and_yolo_say_the_same(tmp_path: Path) -> None:
         kind, cx, cy, w, h = map(float, line.split())
         box = [(cx - w / 2) * wide, (cy - h / 2) * high, w * wide, h * high]
         annotations.append({"image_id": 7, "category_id": int(kind) + 1, "bbox": box})
-    coco = {
-        "images": [{"id": 7, "file_name": "0.png"}],
-        "categories": [{"id": number + 1, "name": name} for number, name in enumerate(names)],
-        "annotations": annotations,
-    }
+    kinds = [{"id": number + 1, "name": name} for number, name in enumerate(names)]
+    coco = {"images": [{"id": 7, "file_name": "0.png"}], "categories": kinds, "annotations": annotations}
     (folder / "coco.json").write_text(json.dumps(coco))
     scores = []
     for place in (folder, folder / "coco.json"):
@@ -130,24 +123,20 @@ def write_sequence(folder: Path, *, frames: int, targets: int) -> Path:
         cv2.imwrite(str(folder / f"img1/{number:06d}.png"), picture)
         if chosen is None:
             inside = (truth.visible > 0.95) & (truth.class_ids == 0)
-            middle = np.abs(
-                (truth.boxes_source_px[:, :2] + truth.boxes_source_px[:, 2:]) / 2 - (640, 360)
-            ).max(1)
+            centres = (truth.boxes_source_px[:, :2] + truth.boxes_source_px[:, 2:]) / 2
+            middle = np.abs(centres - (640, 360)).max(1)
             chosen = [index for index in np.argsort(middle) if inside[index]][:targets]
             chosen = truth.ids[chosen].tolist()
         for target in chosen:
             x1, y1, x2, y2 = truth.boxes_source_px[truth.ids.tolist().index(target)]
-            rows.append(
-                f"{number},{target + 1},{x1 + 1:.1f},{y1 + 1:.1f},{x2 - x1:.1f},{y2 - y1:.1f},1,1,1\n"
-            )
+            box = f"{x1 + 1:.1f},{y1 + 1:.1f},{x2 - x1:.1f},{y2 - y1:.1f}"
+            rows.append(f"{number},{target + 1},{box},1,1,1\n")
     (folder / "gt/gt.txt").write_text("".join(rows))
     (folder / "gt/labels.txt").write_text("car\n")
     return folder
 
 
-def test_one_labelled_target_is_found_or_missed_and_no_more(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_labelled_target_is_found_or_missed_and_no_more(tmp_path, capsys):
     """Whoever sees the other cars of UAV123 is not wrong: its labels name one of them."""
     folder, out = write_sequence(tmp_path / "s", frames=4, targets=1), tmp_path / "out"
     run = ["detect", str(folder), "--provider", "cpu", "--vehicles-as-one", "--out", str(out)]
@@ -168,32 +157,28 @@ def test_one_labelled_target_is_found_or_missed_and_no_more(
     assert json.loads((tmp_path / "o/score.json").read_text())["precision"] is not None
 
 
-def test_what_cannot_be_is_said_before_anything_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_is_said_before_anything_is_written(tmp_path, capsys):
     """No folder, no pictures, no names."""
-    out = tmp_path / "out"
-    assert "does not exist" in sentence(capsys, tmp_path / "none", "--out", out)
+    out, there, folder = tmp_path / "out", tmp_path / "there", draw(tmp_path / "set", moments=1)
     (tmp_path / "empty").mkdir()
-    assert "holds no pictures" in sentence(capsys, tmp_path / "empty", "--out", out)
-    folder = draw(tmp_path / "set", moments=1)
     (folder / "classes.txt").unlink()
-    assert "no classes.txt, obj.names or data.yaml" in sentence(capsys, folder, "--out", out)
-    assert "--confidence is 2.0, must be from 0.01 to 1" in sentence(
-        capsys, folder, "--confidence", 2, "--out", out
-    )
-    for bad in ("[]", "[" * 100_000):
-        (tmp_path / "bad.json").write_text(bad)
-        assert "is not COCO's JSON" in sentence(capsys, tmp_path / "bad.json", "--out", out)
+    for name, text in (("bad.json", "[]"), ("deep.json", "[" * 100_000), ("file", "")):
+        (tmp_path / name).write_text(text)
+    (there / "score.json").mkdir(parents=True)
+    for words, said in (
+        ((tmp_path / "none",), "does not exist"),
+        ((tmp_path / "empty",), "holds no pictures"),
+        ((folder,), "no classes.txt, obj.names or data.yaml"),
+        ((folder, "--confidence", 2), "--confidence is 2.0, must be from 0.01 to 1"),
+        *(((tmp_path / name,), "is not COCO's JSON") for name in ("bad.json", "deep.json")),
+        ((folder, "--classes", CLASSES, "--out", tmp_path / "file"), "file cannot be made (File exists)"),
+        ((folder, "--classes", CLASSES, "--out", there), "score.json is a folder"),
+    ):
+        assert said in sentence(capsys, "--out", out, *words)
     assert not out.exists()
-    out.write_text("")
-    named = (folder, "--classes", CLASSES)
-    assert f"--out {out} cannot be made (File exists)" in sentence(capsys, *named, "--out", out)
-    (tmp_path / "there" / "score.json").mkdir(parents=True)
-    assert "score.json is a folder" in sentence(capsys, *named, "--out", tmp_path / "there")
 
 
-def test_a_full_disk_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_disk_is_one_sentence(tmp_path, capsys):
     """An hour of detections ended in a traceback, or in a sheet that nobody missed."""
     folder, out = draw(tmp_path / "set", moments=1), tmp_path / "out"
     for limit in (10, 20_000):  # of the table, and of the sheets
@@ -203,7 +188,7 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert json.loads((out / "score.json").read_text())["pictures"] == 1
 
 
-def test_a_name_with_brackets_is_shown_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_with_brackets_is_shown_as_it_is(capsys):
     """The hour's score ended in a traceback, or under a name that no file has."""
     figures = dict.fromkeys(("labels", "boxes", "precision", "recall", "f1", "ap50", "calibration_error"))
     print_score({**figures, "detector": "[/a] [b].onnx", "confidence": 0.25, "by_class": {"[/c]": figures}})
@@ -212,7 +197,7 @@ def test_a_name_with_brackets_is_shown_as_it_is(capsys: pytest.CaptureFixture[st
     assert "[/c]" in said
 
 
-def test_calibration_error_of_known_confidences() -> None:
+def test_calibration_error_of_known_confidences():
     """Hand-made: bins that are right as often as they say have no error."""
     sure = np.array([0.75] * 4 + [0.25] * 4)
     right = np.array([1, 1, 1, 0, 1, 0, 0, 0], bool)
@@ -221,7 +206,7 @@ def test_calibration_error_of_known_confidences() -> None:
     assert np.isnan(calibration_error(sure[:0], right[:0]))
 
 
-def test_the_line_of_the_others_is_what_makes_their_scores_true() -> None:
+def test_the_line_of_the_others_is_what_makes_their_scores_true():
     """Whether a calibration holds beyond its own sets could not be told."""
     sure = np.repeat([0.2, 0.5, 0.8], 1000)
     right = np.concatenate([np.arange(1000) < share for share in (59, 500, 941)])  # slope 2: twice as sure
@@ -232,9 +217,7 @@ def test_the_line_of_the_others_is_what_makes_their_scores_true() -> None:
     assert chance_error(sure) < 0.02 < chance_error(sure[::100]), "thirty boxes tell little"
 
 
-def test_of_several_sets_each_is_measured_with_the_line_of_the_others(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_several_sets_each_is_measured_with_the_line_of_the_others(tmp_path, capsys):
     """A figure of all sets together hides the one that is off."""
     sets = [draw(tmp_path / name, moments=1) for name in "ab"]
     assert main(["detect", *map(str, sets), "--out", str(tmp_path / "out"), "--provider", "cpu"]) == 0

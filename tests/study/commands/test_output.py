@@ -1,7 +1,5 @@
 """How far a study is."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -38,15 +36,16 @@ def test_compare_loads_what_it_flies_with_where_it_flies():
     assert found.stdout == "\n"
 
 
-def test_the_time_left_is_that_of_the_last_steps():
-    """Who waits would be told two hours of what takes one."""
-    assert time_left_s(deque([(100.0, 1), (110.0, 2), (140.0, 5)]), 9) == pytest.approx(40.0)
-
-
-def test_of_the_first_steps_nothing_is_concluded():
-    """Two processes that begin together end together: the first estimate would be twice too long."""
-    assert time_left_s(deque([(0.0, 0)]), 80) == 0
-    assert time_left_s(deque([(20.0, 1), (20.1, 2)]), 80) == 0
+@pytest.mark.parametrize(
+    ("steps", "of", "left_s"),
+    [
+        ([(100.0, 1), (110.0, 2), (140.0, 5)], 9, 40.0),
+        *(([(0.0, 0)], 80, 0), ([(20.0, 1), (20.1, 2)], 80, 0)),
+    ],
+)
+def test_the_time_left_is_that_of_the_last_steps(steps, of, left_s):
+    """Two hours would be told of what takes one; of the first steps, which end together, nothing is concluded."""
+    assert time_left_s(deque(steps), of) == pytest.approx(left_s)
 
 
 @pytest.mark.parametrize(("left_s", "says"), [(44.0, "less than a minute"), (50.0, "about 0:00:50")])

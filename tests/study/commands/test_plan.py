@@ -1,7 +1,5 @@
 """``hvt-study plan``: what a study would take, before it is begun."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -12,6 +10,7 @@ from hvt_common.errors import UserError
 from hvt_edge.stills.policy.registry import METHODS
 from hvt_study.cli import main
 from hvt_study.commands.plan import estimate, hours_in_words
+from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs, parse_regimes
 from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.runs.methods import chosen_methods
@@ -64,8 +63,6 @@ def test_each_classifier_is_a_study_of_its_own(tmp_path, capsys):
 
 def test_hours_are_of_every_flight(tmp_path):
     """DDS and the best frame rate are several flights in one row: the estimate would be a fifth of the truth."""
-    from hvt_study.datasets.layouts.uri import open_dataset
-
     write_visdrone(tmp_path, "a", "b", count=60)
     sequences = open_dataset(f"visdrone:{tmp_path}")
     frames = 60
@@ -98,10 +95,8 @@ def test_a_budget_that_cannot_be_flown_is_told(tmp_path, capsys):
 def test_one_line_is_for_plan_and_run(tmp_path, capsys):
     """Who has written the line for `run` must be able to ask first what it takes, with as many processes."""
     write_visdrone(tmp_path, "a")
-    words = [
-        "plan",
-        *arguments(f"visdrone:{tmp_path}", tmp_path / "out", "--methods", "M0,M5", "--jobs", "3"),
-    ]
+    run = arguments(f"visdrone:{tmp_path}", tmp_path / "out", "--methods", "M0,M5", "--jobs", "3")
+    words = ["plan", *run]
     assert main([*words, "--accounting", "pilot", "--tune", "M5:small_weight=0.7"]) == 0
     told = capsys.readouterr().out
     assert re.findall(r"hours with (\d+)", told) == ["3"]
@@ -120,10 +115,8 @@ def test_one_line_is_for_plan_and_run(tmp_path, capsys):
 def test_video_is_coded_again_for_those_that_are_named():
     """A matrix in which one method is compared with video would take five times as long."""
     plan = plan_of("M0,M5,auto", matched_to=("auto",))
-    matched = {
-        one.method: list(matched_runs(plan, one, {"failed": "", "total_bps": 250_000}))
-        for one in first_runs(plan)
-    }
+    row = {"failed": "", "total_bps": 250_000}
+    matched = {one.method: list(matched_runs(plan, one, row)) for one in first_runs(plan)}
     assert {name: len(runs) for name, runs in matched.items()} == {"M0": 0, "M5": 0, "auto": 1}
 
 
@@ -168,12 +161,8 @@ def test_wrong_parameters_are_one_sentence(tmp_path, monkeypatch, word, said):
 
 def test_short_and_long_are_told_in_a_unit_that_says_something():
     """A fast machine plans a study of a frame, too: 9.9e-05 hours, or 0.0, tell nobody how long it takes."""
-    assert [hours_in_words(seconds / 3600) for seconds in (0.36, 40, 600, 3 * 3600 + 60)] == [
-        "0.0001 (less than 1 s)",
-        "0.0111 (40 s)",
-        "0.1667 (10 minutes)",
-        "3.0",
-    ]
+    told = [hours_in_words(seconds / 3600) for seconds in (0.36, 40, 600, 3 * 3600 + 60)]
+    assert told == ["0.0001 (less than 1 s)", "0.0111 (40 s)", "0.1667 (10 minutes)", "3.0"]
 
 
 def test_a_dataset_that_is_not_there_is_named_with_its_options(capsys):

@@ -1,7 +1,5 @@
 """``hvt-study read`` as a user runs it."""
 
-from __future__ import annotations
-
 import json
 
 import cv2
@@ -47,11 +45,8 @@ def test_reading_end_to_end(tmp_path, capsys):
     assert hybrid["roi_bps"] > 0
     assert hybrid["codes"] == len(hybrid["scenes"][0]["codes"]) > 20
     for row in rows[1:]:
-        assert (
-            max(row["base"]["read"], row["stills"]["read"])
-            <= row["composite"]["read"]
-            < source["base"]["read"]
-        )
+        least = max(row["base"]["read"], row["stills"]["read"])
+        assert least <= row["composite"]["read"] < source["base"]["read"]
     known = {code["object"]: code["text"] for code in source["scenes"][0]["codes"]}
     for code in hybrid["scenes"][0]["codes"]:
         for channel in ("base", "stills", "composite"):

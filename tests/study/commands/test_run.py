@@ -1,7 +1,5 @@
 """``hvt-study run`` from its arguments to its table: real flights of a small scene, and wrong input."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal
@@ -20,17 +18,10 @@ from hvt_study.runs.spec import COLUMNS, ModelChoice
 from hvt_study.runs.video_shape import within
 from media.onnx_models import colour_classifier, colour_detector
 from studies.layouts import write_visdrone
-from studies.small_study import (
-    REGIME,
-    SIZE,
-    arguments,
-    detector,
-    entries,
-    flights,
-    table,
-    write_scene,
-)
+from studies.small_study import REGIME, SIZE, arguments, detector, entries, flights, table, write_scene
 
+EVERYWHERE = """duration_s total_bps base_bps roi_bps track_bps fps stills map_50 mota hota idf1 top1 top1_all
+macro_f1 recall f1 delay_p95_ms id_switches"""
 METHODS = ("--methods", "M0,M5,DDS", "--regimes", REGIME)
 
 
@@ -53,30 +44,8 @@ def test_a_row_for_every_run(done):
     order = [(row["method"], row["matched_to"]) for row in rows]
     assert order == [("M0", ""), ("M5", ""), ("M0", "M5"), ("DDS", ""), ("M0", "DDS")]
     assert {row["labels"] for row in rows} == {"annotations"}
-    everywhere = {
-        "duration_s",
-        "total_bps",
-        "base_bps",
-        "roi_bps",
-        "track_bps",
-        "fps",
-        "stills",
-        "map_50",
-        "mota",
-    }
-    everywhere |= {
-        "hota",
-        "idf1",
-        "top1",
-        "top1_all",
-        "macro_f1",
-        "recall",
-        "f1",
-        "delay_p95_ms",
-        "id_switches",
-    }
     for row in rows:
-        assert not {name for name in everywhere if row[name] is None}, row["method"]
+        assert not {name for name in EVERYWHERE.split() if row[name] is None}, row["method"]
         config = json.loads(row["config"])
         assert config["run"]["method"] == row["method"]
         assert config["run"]["max_frames"] is None
@@ -106,9 +75,8 @@ def test_video_spends_what_the_others_really_spent(done):
         assert within(row["total_bps"], row["target_bps"])
     for row in rows:
         parts = row["base_bps"] + row["roi_bps"] + row["track_bps"]
-        assert (
-            0 <= row["total_bps"] - parts < 0.05 * row["total_bps"]
-        )  # the rest is status, and what DDS asks
+        # The rest is status, and what DDS asks.
+        assert 0 <= row["total_bps"] - parts < 0.05 * row["total_bps"]
         # Thirty of thirty images at 15 a second: the clip is as long as the processed span.
         assert row["total_bps_pilot"] == row["total_bps"]
 
@@ -169,9 +137,8 @@ def test_a_study_beside_another_in_one_folder_keeps_its_rows(scene, done, tmp_pa
         return own
 
     monkeypatch.setattr(command, "run_all", flown)
-    assert (
-        main(["run", *arguments(scene, tmp_path, "--methods", "M0", "--regimes", REGIME, "--jobs", "1")]) == 0
-    )
+    words = arguments(scene, tmp_path, "--methods", "M0", "--regimes", REGIME, "--jobs", "1")
+    assert main(["run", *words]) == 0
     assert {row["key"] for row in table(tmp_path)} == {row["key"] for row in (*own, *other)}
 
 
@@ -268,20 +235,14 @@ def test_a_classifier_names_the_reference_labels(scene, tmp_path):
     assert open_materials(*first_runs(plain), cache=plan.cache).classes.word("minivan") == "car"
 
 
-def spoken(capsys, *words):
-    assert main(["run", *words]) == 2
-    return capsys.readouterr().err
-
-
 def test_wrong_input_is_one_sentence(scene, tmp_path, capsys):
     """A traceback after an hour, in place of what is wrong before the first flight."""
     write_visdrone(tmp_path / "bare", "one")
     (tmp_path / "bare" / "annotations" / "one.txt").unlink()
-    other = colour_detector(
-        tmp_path / "other.onnx", "yolox", metadata={"names": "{0: 'cat', 1: 'dog', 2: 'cow'}"}
-    )
-    out = tmp_path / "out"
-    for words, wanted in (
+    names = {"names": "{0: 'cat', 1: 'dog', 2: 'cow'}"}
+    other = colour_detector(tmp_path / "other.onnx", "yolox", metadata=names)
+    (tmp_path / "file").write_text("")
+    for words, wanted, *place in (
         ((f"visdrone:{tmp_path}/bare",), "has no annotations"),
         ((f"visdrone:{tmp_path}/bare?labels=none",), "add --labels reference"),
         ((scene, "--detector", str(other)), "nothing in common"),
@@ -292,12 +253,12 @@ def test_wrong_input_is_one_sentence(scene, tmp_path, capsys):
         ((scene, "--regimes", "9kbps", "--methods", "M0", "--jobs", "1"), "every run failed"),
         ((scene, "--max-frames", "3"), "--max-frames 3 is too few"),
         ((scene, "--detect-every", "0"), "--detect-every 0"),
+        ((scene, *METHODS), "--out", "file"),
     ):
-        sentence = spoken(capsys, *arguments(words[0], out, *words[1:]))
+        assert main(["run", *arguments(words[0], tmp_path / (place or ["out"])[0], *words[1:])]) == 2
+        sentence = capsys.readouterr().err
         assert wanted in sentence, sentence
         assert sentence.rstrip("\n").splitlines()[-1].startswith("hvt-study: ")
-    (tmp_path / "file").write_text("")
-    assert "--out" in spoken(capsys, *arguments(scene, tmp_path / "file", *METHODS))
 
 
 @pytest.mark.parametrize("command", ["run", "tune"])

@@ -1,9 +1,6 @@
 """``hvt-study track`` and the MOTChallenge files it reads and writes."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,18 +11,17 @@ from hvt_study.commands.track import detections_by_frame, read_detections
 LINE = "{frame},-1,{x},20,40,60,{score},-1,-1,-1\n"
 
 
-def write(path: Path, lines: list[str]) -> Path:
-    """Write a small file and name it."""
+def write(path, lines):
     path.write_text("".join(lines))
     return path
 
 
-def moving(frames: list[int], *, score: float = 0.9) -> list[str]:
+def moving(frames, *, score=0.9):
     """Lines of one object at 2 px a frame."""
     return [LINE.format(frame=k, x=100 + 2 * k, score=score) for k in frames]
 
 
-def sentence(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def sentence(capsys, *arguments):
     """The one line on stderr of a call that must end with exit code 2."""
     assert main([str(each) for each in arguments]) == 2
     captured = capsys.readouterr()
@@ -37,34 +33,24 @@ def sentence(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 @pytest.mark.realdata
-def test_upstream_is_reproduced_from_file_to_file(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_upstream_is_reproduced_from_file_to_file(data, tmp_path, capsys):
     """Whoever checks the tracker against the authors' program would find another result."""
     results = json.loads((data / "tracking/palace/detections.json").read_text())["results"]
-    source = write(
-        tmp_path / "det.txt",
-        [
-            f"{int(r['frame_id']) + 1},-1,{r['x']},{r['y']},{r['width']},{r['height']},{r['prob']}\n"
-            for r in results
-        ],
-    )
-    out = tmp_path / "tracks.txt"
-    options = [
-        *("--fps=30", "--track-thresh=0.5", "--track-buffer=30", "--match-thresh=0.8", "--min-box-area=10")
-    ]
-    assert main(["track", str(source), "--out", str(out), *options]) == 0
+    sides = ("x", "y", "width", "height", "prob")
+    lines = [f"{int(r['frame_id']) + 1},-1,{','.join(str(r[side]) for side in sides)}\n" for r in results]
+    source, out = write(tmp_path / "det.txt", lines), tmp_path / "tracks.txt"
+    options = "--fps=30 --track-thresh=0.5 --track-buffer=30 --match-thresh=0.8 --min-box-area=10"
+    assert main(["track", str(source), "--out", str(out), *options.split()]) == 0
     assert capsys.readouterr().out == f"{out}: 314 frames, 45 tracks, 5961 boxes\n"
-    ours, theirs = (
-        np.loadtxt(path, delimiter=",") for path in (out, data / "tracking/palace/bytetrack_tracks.txt")
-    )
+    files = (out, data / "tracking/palace/bytetrack_tracks.txt")
+    ours, theirs = (np.loadtxt(path, delimiter=",") for path in files)
     theirs[:, 0] += 1
     theirs = theirs[np.lexsort((theirs[:, 1], theirs[:, 0]))]
     np.testing.assert_array_equal(ours[:, [0, 1, 7, 8, 9]], theirs[:, [0, 1, 7, 8, 9]])
     np.testing.assert_allclose(ours[:, 2:7], theirs[:, 2:7], atol=1e-3)
 
 
-def test_frames_without_detections_are_stepped(tmp_path: Path) -> None:
+def test_frames_without_detections_are_stepped(tmp_path):
     """A track hidden for longer than the buffer would come back with its old id, or a short gap would end it."""
     out = tmp_path / "out.txt"
     for gap, ids in ((20, [1]), (60, [1, 2])):
@@ -75,7 +61,7 @@ def test_frames_without_detections_are_stepped(tmp_path: Path) -> None:
         assert rows["frame"].max() == 19 + gap
 
 
-def test_options_reach_the_tracker(tmp_path: Path) -> None:
+def test_options_reach_the_tracker(tmp_path):
     """Comparisons with other parameters would compare nothing."""
     source = write(tmp_path / "det.txt", moving(list(range(1, 8)), score=0.45))
     out = tmp_path / "out.txt"
@@ -93,7 +79,7 @@ def test_options_reach_the_tracker(tmp_path: Path) -> None:
     assert boxes("--track-thresh", "0.3", "--match-thresh", "0.4", "--no-fuse-scores") == 7
 
 
-def test_unordered_lines_blank_lines_and_further_columns_are_read(tmp_path: Path) -> None:
+def test_unordered_lines_blank_lines_and_further_columns_are_read(tmp_path):
     """Files of other detectors would be refused, or their frames mixed up."""
     path = tmp_path / "det.txt"
     path.write_bytes(
@@ -106,7 +92,7 @@ def test_unordered_lines_blank_lines_and_further_columns_are_read(tmp_path: Path
     assert frames[3].confidences.tolist() == [0.5, 0.75]
 
 
-def test_an_empty_file_gives_an_empty_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_empty_file_gives_an_empty_file(tmp_path, capsys):
     """A sequence without any object would stop a batch of experiments."""
     source, out = write(tmp_path / "det.txt", ["\n"]), tmp_path / "out.txt"
     assert main(["track", str(source), "--out", str(out)]) == 0
@@ -114,9 +100,7 @@ def test_an_empty_file_gives_an_empty_file(tmp_path: Path, capsys: pytest.Captur
     assert "0 frames, 0 tracks, 0 boxes" in capsys.readouterr().out
 
 
-def test_detections_without_area_are_left_out_and_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_detections_without_area_are_left_out_and_counted(tmp_path, capsys):
     """One box turned inside out would spoil all tracks, or vanish without a word."""
     lines = [*moving([1, 2, 3]), "2,-1,5,5,-4,9,0.9\n", "3,-1,5,5,0,9,0.9\n"]
     assert main(["track", str(write(tmp_path / "d.txt", lines)), "--out", str(tmp_path / "o.txt")]) == 0
@@ -137,7 +121,7 @@ def test_detections_without_area_are_left_out_and_counted(
         "2 -1 1 2 3 4 0.9",
     ],
 )
-def test_a_malformed_line_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str) -> None:
+def test_a_malformed_line_is_named(tmp_path, capsys, line):
     """The user would search a file of a million lines for the bad one."""
     source = write(tmp_path / "det.txt", [*moving([1]), line + "\n"])
     said = sentence(capsys, "track", source, "--out", tmp_path / "out.txt")
@@ -145,26 +129,27 @@ def test_a_malformed_line_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert not (tmp_path / "out.txt").exists()
 
 
-def test_wrong_files_and_arguments_are_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_files_and_arguments_are_one_sentence(tmp_path, capsys):
     """The user would be shown a traceback in place of what to change."""
-    source, out = write(tmp_path / "det.txt", moving([1, 2])), tmp_path / "out.txt"
+    source, out = write(tmp_path / "det.txt", moving([1, 2])), ("--out", tmp_path / "out.txt")
     binary = tmp_path / "model.onnx"
     binary.write_bytes(b"\x08\x07\xff\xfe\x80")
-    assert "none.txt cannot be read" in sentence(capsys, "track", tmp_path / "none.txt", "--out", out)
-    assert "not UTF-8 text" in sentence(capsys, "track", binary, "--out", out)
-    assert "cannot be read" in sentence(capsys, "track", tmp_path, "--out", out)
-    assert "cannot be written" in sentence(capsys, "track", source, "--out", tmp_path / "no" / "out.txt")
-    assert f"--out {source} is {source} itself" in sentence(capsys, "track", source, "--out", source)
-    for fps in ("0", "-5", "nan", "inf", "fast"):
-        assert f"--fps: is {fps}," in sentence(capsys, "track", source, "--out", out, f"--fps={fps}")
-    assert "--track-thresh: is 2," in sentence(capsys, "track", source, "--out", out, "--track-thresh=2")
-    assert "--low-thresh is 0.9" in sentence(capsys, "track", source, "--out", out, "--low-thresh=0.9")
-    assert "--track-buffer: is -1," in sentence(capsys, "track", source, "--out", out, "--track-buffer=-1")
-    assert "--out" in sentence(capsys, "track", source)
-    assert "invalid choice: 'fly'" in sentence(capsys, "fly")
-    assert "COMMAND" in sentence(capsys)
+    for words, said in (
+        (("track", tmp_path / "none.txt", *out), "none.txt cannot be read"),
+        (("track", binary, *out), "not UTF-8 text"),
+        (("track", tmp_path, *out), "cannot be read"),
+        (("track", source, "--out", tmp_path / "no" / "out.txt"), "cannot be written"),
+        (("track", source, "--out", source), f"--out {source} is {source} itself"),
+        *(
+            (("track", source, *out, f"--fps={fps}"), f"--fps: is {fps},")
+            for fps in (0, -5, "nan", "inf", "fast")
+        ),
+        (("track", source, *out, "--track-thresh=2"), "--track-thresh: is 2,"),
+        (("track", source, *out, "--low-thresh=0.9"), "--low-thresh is 0.9"),
+        (("track", source, *out, "--track-buffer=-1"), "--track-buffer: is -1,"),
+        *((("track", source), "--out"), (("fly",), "invalid choice: 'fly'"), ((), "COMMAND")),
+    ):
+        assert said in sentence(capsys, *words)
 
 
 @pytest.mark.parametrize(
@@ -175,9 +160,7 @@ def test_wrong_files_and_arguments_are_one_sentence(
         ("2,7,10,10,20,20,0.5\n", "line 2 is '2,7,10,10,20,20,0.5'; accepted is -1 in column 2"),
     ],
 )
-def test_what_is_no_detection_is_refused_with_its_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, words: str
-) -> None:
+def test_what_is_no_detection_is_refused_with_its_line(tmp_path, capsys, line, words):
     """Scores of 0 to 100 would all be certain, and a file of tracks be tracked again."""
     source = write(tmp_path / "det.txt", ["1,-1,10,10,20,20,0.9\n", line])
     assert words in sentence(capsys, "track", source, "--out", tmp_path / "out.txt")

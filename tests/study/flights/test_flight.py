@@ -1,25 +1,16 @@
 """A whole flight in one process, on small drawn pictures with a detector of red things."""
 
-from __future__ import annotations
-
-from dataclasses import replace
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
-from hvt_common.config import load
-from hvt_edge.config import EdgeConfig
-from hvt_edge.config import check as check_edge
-from hvt_ground.config import GroundConfig
-from hvt_ground.config import check as check_ground
-from hvt_study.datasets.sequence import Clip
-from hvt_study.flights.flight import Flight, FlightPlan, coded_frames, fly
+from hvt_study.flights.flight import Flight, coded_frames, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.reading.flight import _ReadGround
 from media.clips import smooth_pictures
 from rigs.flight import SIZE, RedSquares, grainy_pictures, square_box
-from studies.metric_frames import list_f1
+from studies.metric_frames import clip_of, flight_plan, list_f1
 
 FRAMES = 46
 STILLS = ("--method", "M5", "--cooldown", "0s", "--budget", "120kbps", "--still-codec", "residual")
@@ -28,31 +19,17 @@ STILLS = ("--method", "M5", "--cooldown", "0s", "--budget", "120kbps", "--still-
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
     """A red square that moves seven pixels a frame over a smooth ground, and jumps back once."""
-    pictures = np.stack(smooth_pictures(FRAMES, size=SIZE))
-    path = tmp_path_factory.mktemp("clip") / "clip.bgr"
-    path.write_bytes(pictures.tobytes())
-    return Clip("drawn", SIZE, FRAMES, path)
+    return clip_of(smooth_pictures(FRAMES, size=SIZE), tmp_path_factory.mktemp("clip"))
 
 
 @pytest.fixture(scope="module")
 def rough_clip(tmp_path_factory):
     """The same with a grain on the square."""
-    path = tmp_path_factory.mktemp("rough") / "clip.bgr"
-    path.write_bytes(np.stack(grainy_pictures(FRAMES)).tobytes())
-    return Clip("drawn", SIZE, FRAMES, path)
-
-
-def planned(clip, *flags, link_bps=200_000):
-    width, height = SIZE
-    base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}"]
-    base += ["--budget", "200kbps", "--preset", "ultrafast"]
-    edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
-    ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
-    return FlightPlan(clip, check_edge(edge), ground, link_bps)
+    return clip_of(grainy_pictures(FRAMES), tmp_path_factory.mktemp("rough"))
 
 
 def flown(clip, *flags, link_bps=200_000, detector=None, ground_detector=None):
-    plan = planned(clip, *flags, link_bps=link_bps)
+    plan = flight_plan(clip, *flags, link_bps=link_bps)
     return fly(plan, detector=detector or RedSquares(), models=SharedModels(ground_detector or RedSquares()))
 
 
@@ -118,7 +95,7 @@ def test_a_thin_link_delivers_late(clip):
 
 def test_who_reads_a_flight_sees_all_of_it_and_changes_nothing(rough_clip):
     """`hvt-study read` would end in a traceback, or tell of another flight than the one that is compared."""
-    plan, observer = planned(rough_clip, *STILLS), MagicMock()
+    plan, observer = flight_plan(rough_clip, *STILLS), MagicMock()
     parts = {"config": plan.ground, "models": SharedModels(RedSquares()), "observer": observer}
     flight = Flight(
         plan, detector=RedSquares(), make_ground=lambda info, link: _ReadGround(info, link=link, **parts)

@@ -1,7 +1,5 @@
 """``hvt-study run --dask``: a scheduler and two workers as processes of their own on loopback."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -24,26 +22,22 @@ class Cluster:
         (port,) = free_ports(1)
         self.address = f"tcp://127.0.0.1:{port}"
         self._folder, self._stack = folder, ExitStack()
-        self.scheduler = self._start(
-            "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"
-        )
-        self.workers = [
-            self._start("worker", self.address, *_WORKER, env=env) for env in (holding(folder, kept=1), None)
-        ]
+        local = ("--host", "127.0.0.1", "--no-dashboard")
+        self.scheduler = self._start("scheduler", *local, "--port", str(port))
+        alone = (*local, "--nthreads", "1", "--no-nanny", "--memory-limit", "0")
+        environments = (holding(folder, kept=1), None)
+        self.workers = [self._start("worker", self.address, *alone, env=env) for env in environments]
 
     def _start(self, what, *words, env=None):
         log = self._stack.enter_context((self._folder / f"{what}.log").open("a"))
         code = f"from distributed.cli.dask_{what} import main; main()"
-        command = [sys.executable, "-c", code, *words]
-        process = subprocess.Popen(
-            command, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=env
-        )
+        command, log = [sys.executable, "-c", code, *words], {"stdout": log, "stderr": log}
+        process = subprocess.Popen(command, cwd=self._folder, stdin=subprocess.DEVNULL, env=env, **log)
         self._stack.callback(process.wait, PATIENT_S)
         self._stack.callback(process.kill)
         return process
 
     def ready(self):
-        """Both have registered."""
         return (self._folder / "worker.log").read_text().count("Registered to") == 2
 
     def __enter__(self):
@@ -55,9 +49,6 @@ class Cluster:
 
     def __exit__(self, *_):
         self._stack.close()
-
-
-_WORKER = ("--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0")
 
 
 def test_a_worker_is_lost_in_mid_run(scene, tmp_path):
@@ -96,8 +87,9 @@ def test_a_cluster_that_is_lost_is_told_in_a_sentence(scene, tmp_path):
         until(process, lambda: flights(out / "cache"))
         cluster.scheduler.kill()
         assert process.wait(PATIENT_S) == 2, said(tmp_path)
-    assert "the scheduler was lost" in said(tmp_path).splitlines()[-1]
-    assert "finished runs are kept" in said(tmp_path).splitlines()[-1]
+    last = said(tmp_path).splitlines()[-1]
+    assert "the scheduler was lost" in last
+    assert "finished runs are kept" in last
     assert "Traceback" not in said(tmp_path)
     assert flights(out / "cache")
 

@@ -1,7 +1,5 @@
 """What a run holds in memory is a window of frames, not the clip."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The processes of a study."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """How long a comparison still takes."""
 
-from __future__ import annotations
-
 import heapq
 
 import pytest

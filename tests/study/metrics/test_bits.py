@@ -1,31 +1,21 @@
 """Bits, stills, delay and the pilot's proxies, against counts done by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 
 from hvt_study.datasets.labels import NO_ID
+from hvt_study.metrics import observed
 from hvt_study.metrics.bits import line_rates, still_counts
-from hvt_study.metrics.observed import (
-    Opinion,
-    RefinedObject,
-    StillArrival,
-    proxies,
-    score_entropy_nats,
-    still_delays_ms,
-)
-
-SECOND = 1_000_000_000
+from hvt_study.metrics.observed import Opinion, proxies, score_entropy_nats, still_delays_ms
 
 
 def still(number, *, size=1000, capture_s=1.0, arrived_s=1.5):
-    return StillArrival(number, capture_s, capture_s + 0.1, arrived_s, size, size + 180, "due")
+    return observed.StillArrival(number, capture_s, capture_s + 0.1, arrived_s, size, size + 180, "due")
 
 
 def named(number, track, *, share=0.01, base=None, seen=None):
-    return RefinedObject(number, track, 2.0, "car", "bus", share, base, seen)
+    return observed.RefinedObject(number, track, 2.0, "car", "bus", share, base, seen)
 
 
 def test_the_parts_add_up_to_the_whole():
@@ -47,21 +37,20 @@ def test_the_pilots_accounting():
     assert rates[0] / rates[1] == pytest.approx(2.625)
 
 
-def test_no_time_to_divide_by():
+@pytest.mark.parametrize(
+    "rate",
+    [lambda: line_rates({"base": 1}, seconds=math.nan), lambda: still_counts([], [], seconds=0.0)],
+)
+def test_no_time_to_divide_by(rate):
     """A rate of nothing by nothing must not stand in a table."""
-    with pytest.raises(ValueError, match="divided by nan s, must be above 0"):
-        line_rates({"base": 1}, seconds=math.nan)
-    with pytest.raises(ValueError, match="must be above 0"):
-        still_counts([], [], seconds=0.0)
+    with pytest.raises(ValueError, match=r"divided by (nan|0\.0) s, must be above 0"):
+        rate()
 
 
 def test_stills_and_the_tracks_that_they_named():
     """Two stills of one track refine one track; one that matched none refines none."""
-    counts = still_counts(
-        [still(1, size=800), still(2, size=1200), still(3, size=1000)],
-        [named(1, 7), named(2, 7), named(2, 8), named(3, NO_ID)],
-        seconds=30.0,
-    )
+    stills = [still(1, size=800), still(2, size=1200), still(3, size=1000)]
+    counts = still_counts(stills, [named(1, 7), named(2, 7), named(2, 8), named(3, NO_ID)], seconds=30.0)
     assert counts == {"stills": 3, "stills_per_min": 6.0, "mean_still_bytes": 1000.0, "tracks_refined": 2}
     nothing = still_counts([], [], seconds=30.0)
     assert (nothing["stills"], nothing["stills_per_min"], nothing["tracks_refined"]) == (0, 0.0, 0)
@@ -84,23 +73,25 @@ def test_proxies():
     ]
     score = proxies(objects)
     assert (score["proxy_pairs"], score["small_pairs"]) == (3, 2)
-    assert score["confidence_base"] == pytest.approx(1.7 / 3)
-    assert score["confidence_refined"] == pytest.approx(1.8 / 3)
-    assert score["confidence_gain"] == pytest.approx(0.1 / 3)
-    assert score["positive_rate"] == pytest.approx(1 / 3)
-    assert score["change_rate"] == pytest.approx(1 / 3)
-    assert score["entropy_gain_nats"] == pytest.approx(0.1)
-    assert score["small_confidence_gain"] == pytest.approx(0.15)
-    assert score["small_entropy_gain_nats"] == pytest.approx(0.3)
+    wanted = {"confidence_base": 1.7 / 3, "confidence_refined": 1.8 / 3, "confidence_gain": 0.1 / 3}
+    wanted |= {"positive_rate": 1 / 3, "change_rate": 1 / 3, "entropy_gain_nats": 0.1}
+    wanted |= {"small_confidence_gain": 0.15, "small_entropy_gain_nats": 0.3}
+    assert {name: score[name] for name in wanted} == pytest.approx(wanted)
     nothing = proxies([])
     assert (nothing["proxy_pairs"], nothing["small_pairs"]) == (0, 0)
     assert math.isnan(nothing["small_confidence_gain"])
 
 
-def test_entropy_of_a_detectors_score():
+@pytest.mark.parametrize(
+    ("score", "classes", "nats"),
+    [
+        (1.0, 4, 0.0),
+        (0.25, 4, math.log(4)),
+        (0.0, 4, math.log(3)),
+        (0.5, 2, math.log(2)),
+        (0.5, 1, math.log(2) / 2),
+    ],
+)
+def test_entropy_of_a_detectors_score(score, classes, nats):
     """Certain is 0 nats, and as likely as any other of four classes is ln 4."""
-    assert score_entropy_nats(1.0, 4) == 0.0
-    assert score_entropy_nats(0.25, 4) == pytest.approx(math.log(4))
-    assert score_entropy_nats(0.0, 4) == pytest.approx(math.log(3))
-    assert score_entropy_nats(0.5, 2) == pytest.approx(math.log(2))
-    assert score_entropy_nats(0.5, 1) == pytest.approx(-0.5 * math.log(0.5))
+    assert score_entropy_nats(score, classes) == pytest.approx(nats)

@@ -1,7 +1,5 @@
 """Classes of tracks over time, and how long the right one takes, against counts done by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -39,6 +37,10 @@ def test_after_refinement():
     assert score.macro_f1_all == pytest.approx((2 / 3 + 2 / 3) / 4)
     # Of those found: car 2·1/(1+2), bus 1, truck 0.
     assert score.macro_f1_found == pytest.approx((2 / 3 + 1) / 3)
+    # Without what is before it, the stills' gain could not be told from the detector's skill.
+    before = class_score(judged([frame_of_four()]), refined=False)
+    assert before.counts == ClassCounts(right=1, found=3, labels=4)
+    assert before.macro_f1_found == pytest.approx(0.5 / 3)  # car 2·1/(1+3), the others 0
 
 
 def test_listing_more_wins_nothing():
@@ -51,14 +53,6 @@ def test_listing_more_wins_nothing():
     assert few.counts.top1_all == many.counts.top1_all == 1.0
     assert (few.named_f1, few.false_per_frame) == (1.0, 0.0)
     assert (many.named_f1, many.false_per_frame) == (pytest.approx(4 / 7), 3.0)
-
-
-def test_before_refinement():
-    """Without this the stills' gain could not be told from the detector's skill."""
-    score = class_score(judged([frame_of_four()]), refined=False)
-    assert score.counts == ClassCounts(right=1, found=3, labels=4)
-    # car 2·1/(1+3), the others 0
-    assert score.macro_f1_found == pytest.approx(0.5 / 3)
 
 
 def test_every_frame_counts_not_only_the_refined_one():
@@ -128,20 +122,14 @@ def sequence(*lives):
 
 def test_time_to_the_first_right_class():
     """How long an operator looks at a wrong word; tracks that never come right must not be forgotten."""
-    waits = first_correct(judged(sequence("bbbbb", "-ccbb", "ccccc")), fps=10)
+    frames = judged(sequence("bbbbb", "-ccbb", "ccccc"))
+    waits = first_correct(frames, fps=10)
     assert waits.waits_s.tolist() == [0.0, 0.3, 0.4]
     assert (waits.tracks, waits.never) == (3, 1)
     # Kaplan-Meier: 2/3 still wait after 0 s, 1/3 after 0.3 s, and no one knows more.
-    assert waits.median_s == pytest.approx(0.3)
-    assert waits.p90_s == math.inf
-    assert waits.quantile_s(1 / 3) == 0.0
-
-
-def test_who_is_shown_late_waits_for_longer():
-    """A method that answers two seconds late would seem as quick as one that answers at once."""
-    late = first_correct(
-        judged(sequence("bbbbb", "-ccbb", "ccccc")), fps=10, shown_s=[2.0, 2.1, 2.2, 2.3, 2.5]
-    )
+    assert (waits.median_s, waits.p90_s, waits.quantile_s(1 / 3)) == (pytest.approx(0.3), math.inf, 0.0)
+    # A method that answers two seconds late is not as quick as one that answers at once.
+    late = first_correct(frames, fps=10, shown_s=[2.0, 2.1, 2.2, 2.3, 2.5])
     assert late.waits_s.tolist() == pytest.approx([2.0, 2.3, 2.5])
     assert late.never == 1
 

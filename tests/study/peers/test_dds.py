@@ -1,7 +1,5 @@
 """The two-pass peer from camera to list, on small drawn pictures with a detector of red things."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -10,12 +8,11 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
-from hvt_study.datasets.sequence import Clip
 from hvt_study.metrics.observed import detected_frames
 from hvt_study.peers.dds import DdsSettings, fly_dds
 from media.clips import hard_pictures, smooth_pictures
 from rigs.flight import CLASSES, SIZE, RedSquares, square_box
-from studies.metric_frames import list_f1
+from studies.metric_frames import clip_of, list_f1
 
 FRAMES = 46
 BUDGET_BPS = 200_000
@@ -47,12 +44,6 @@ class Doubtful:
             rows.append((*DIM_AT, self.sharp if contrast > 38 else self.blurred, 1))
         table = np.array(rows, np.float32).reshape(-1, 6)
         return Detections(table[:, :4], table[:, 4], table[:, 5].astype(np.int32))
-
-
-def clip_of(pictures, folder):
-    path = folder / "clip.bgr"
-    path.write_bytes(np.stack(pictures).tobytes())
-    return Clip("drawn", SIZE, len(pictures), path)
 
 
 @pytest.fixture(scope="module")
@@ -202,14 +193,9 @@ def test_frames_between_coded_ones_are_predicted(clip):
 
 def test_boxes_are_in_source_pixels(tmp_path_factory):
     """Labels are: a list in base pixels would match nothing."""
-    pictures = [
-        cv2.resize(picture, (640, 384), interpolation=cv2.INTER_NEAREST)
-        for picture in smooth_pictures(12, size=SIZE)
-    ]
-    path = tmp_path_factory.mktemp("large") / "clip.bgr"
-    path.write_bytes(np.stack(pictures).tobytes())
-    clip = Clip("drawn", (640, 384), 12, path)
-    report = flown(clip, detector=RedSquares())
+    small = smooth_pictures(12, size=SIZE)
+    large = [cv2.resize(one, (640, 384), interpolation=cv2.INTER_NEAREST) for one in small]
+    report = flown(clip_of(large, tmp_path_factory.mktemp("large")), detector=RedSquares())
     (box,) = report.lists[5].boxes_xyxy_px
     assert np.abs(box - 2 * np.array(square_box(5))).max() < 8
 

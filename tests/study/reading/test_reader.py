@@ -1,7 +1,5 @@
 """The reader on the drawn scene's own roofs."""
 
-from __future__ import annotations
-
 import socket
 
 import cv2
@@ -17,13 +15,11 @@ AT_S = 3.0
 
 @pytest.fixture(scope="module")
 def scene():
-    """Draw one seed with codes."""
     return Scene(0, codes=True)
 
 
 @pytest.fixture(scope="module")
 def reader():
-    """Open the networks once."""
     return CodeReader()
 
 

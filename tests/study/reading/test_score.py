@@ -1,7 +1,5 @@
 """Which codes count, and what a row says of their readings."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -41,27 +39,31 @@ def test_a_code_counts_when_it_was_whole_in_view_for_a_second():
     assert found[3].height_px == 12.0
 
 
-def test_the_first_right_reading_stays():
-    """A later mistake, however confident, does not take away what an operator has read already."""
-    found = evidence(("KP4", 0.9, 1.0), ("KP47", 0.3, 2.0), ("KR47", 0.99, 3.0), ("KP47", 0.99, 4.0))
-    assert (found.right, found.read_s, found.best.text) == (True, 2.0, "KP47")
-
-
-def test_of_wrong_readings_the_most_confident_stays():
-    """The sheet of examples would show a guess in place of what the reader insisted on."""
-    found = evidence(("KR47", 0.6, 1.0), ("K", 0.9, 2.0), ("KR41", 0.8, 3.0))
-    assert (found.right, found.read_s, found.best.text) == (False, math.inf, "K")
+@pytest.mark.parametrize(
+    ("said", "right", "read_s", "best"),
+    [
+        # A later mistake, however confident, does not take away what an operator has read already.
+        (
+            (("KP4", 0.9, 1.0), ("KP47", 0.3, 2.0), ("KR47", 0.99, 3.0), ("KP47", 0.99, 4.0)),
+            True,
+            2.0,
+            "KP47",
+        ),
+        # The sheet of examples would show a guess in place of what the reader insisted on.
+        ((("KR47", 0.6, 1.0), ("K", 0.9, 2.0), ("KR41", 0.8, 3.0)), False, math.inf, "K"),
+    ],
+)
+def test_the_first_right_reading_stays_and_of_wrong_ones_the_most_confident(said, right, read_s, best):
+    """What an operator has read would be taken away, or a guess be shown."""
+    found = evidence(*said)
+    assert (found.right, found.read_s, found.best.text) == (right, read_s, best)
 
 
 def test_shares_and_waits():
     """The headline of the page: how many, how soon, and how many codes would mislead somebody."""
     codes = [Code(number, "KP47", first_s, 8.0) for number, first_s in enumerate((0.0, 1.0, 0.0, 0.0, 0.0))]
-    found = {
-        0: evidence(("KP47", 0.9, 3.0)),
-        1: evidence(("KP47", 0.9, 2.0)),
-        2: evidence(("KP47", 0.9, 4.5)),
-        3: evidence(("KR47", 0.8, 1.0)),
-    }
+    said = (("KP47", 0.9, 3.0), ("KP47", 0.9, 2.0), ("KP47", 0.9, 4.5), ("KR47", 0.8, 1.0))
+    found = {number: evidence(one) for number, one in enumerate(said)}
     score = channel_score(codes, found)
     assert score.read == pytest.approx(3 / 5)
     assert score.median_s == 4.5  # waits of 1, 3, 4.5 seconds, and two for ever

@@ -1,9 +1,5 @@
 """The demo's picture."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -14,7 +10,7 @@ from hvt_study.metrics.judged import FrameView
 
 
 @pytest.mark.parametrize(("panels", "pairs"), [(1, 0), (1, 3), (3, 1)])
-def test_any_number_of_flights_and_stills_makes_a_picture(tmp_path: Path, panels: int, pairs: int) -> None:
+def test_any_number_of_flights_and_stills_makes_a_picture(tmp_path, panels, pairs):
     """After half an hour's flights a traceback would come in place of the table."""
     grey = np.full((360, 640, 3), 90, np.uint8)
     panel = Panel("auto", grey, FrameView.plain([[300, 150, 340, 190]], ["car"]), FrameLabels())

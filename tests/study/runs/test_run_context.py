@@ -1,7 +1,5 @@
 """What runs over one sequence share."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Codes on the roofs of the drawn scene, and their truth."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

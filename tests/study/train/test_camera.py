@@ -1,7 +1,5 @@
 """What three detectors say of a picture that nobody labelled."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hvt_train.pictures.camera import Said, agreed, without_what_stands
@@ -11,7 +9,6 @@ AREA_PX = 640 * 360
 
 
 def said(teacher, name, score, x, *, side=30):
-    """A square at ``x``."""
     return Said(teacher, name, score, np.array([x, 50, x + side, 50 + side], np.float32))
 
 
@@ -28,8 +25,7 @@ def test_two_that_are_sure_make_a_label_and_one_that_is_not_makes_no_ground():
         ],
         area_px=AREA_PX,
     )
-    found = dict(zip(boxes[:, 0].astype(int).tolist(), kinds.tolist(), strict=True))
-    assert found == {
+    assert dict(zip(boxes[:, 0].astype(int).tolist(), kinds.tolist(), strict=True)) == {
         100: ID["car"],
         200: VEHICLE,
         300: -1,
@@ -41,9 +37,8 @@ def test_two_that_are_sure_make_a_label_and_one_that_is_not_makes_no_ground():
 
 def test_half_a_picture_is_not_left_out_for_a_guess():
     """A weak box around the whole road would take all of its ground from training."""
-    boxes, _ = agreed(
-        [said(0, "vehicle", 0.2, 0, side=300), said(1, "car", 0.12, 0, side=40)], area_px=AREA_PX
-    )
+    found = [said(0, "vehicle", 0.2, 0, side=300), said(1, "car", 0.12, 0, side=40)]
+    boxes, _ = agreed(found, area_px=AREA_PX)
     assert boxes[:, 2].tolist() == [40]
 
 

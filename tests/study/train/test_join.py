@@ -1,7 +1,5 @@
 """The two networks of the embedded detector in one file."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -42,10 +40,8 @@ def test_stripes_give_the_same_numbers(activation, height, tmp_path):
     """Each of them sees what lies beyond its edges, and only the picture's own edges are filled up."""
     rng = np.random.default_rng(1)
     shapes = {"first": (4, 3, 6, 6), "second": (4, 1, 3, 3), "third": (5, 4, 1, 1)}
-    weights = [
-        numpy_helper.from_array(rng.normal(size=shape).astype(np.float32), name)
-        for name, shape in shapes.items()
-    ]
+    drawn = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    weights = [numpy_helper.from_array(values, name) for name, values in drawn.items()]
     text = """
       stem (float[1, 3, height, width] images) => (float[1, 5, h, w] out) {
         a = Conv <strides = [2, 2], pads = [2, 2, 2, 2]> (images, first)
@@ -72,9 +68,8 @@ def test_stripes_give_the_same_numbers(activation, height, tmp_path):
     answers = []
     for number, graph in enumerate((whole, striped)):
         path = tmp_path / f"{number}.onnx"
-        onnx.save(
-            helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), str(path)
-        )
+        opset = [helper.make_opsetid("", 17)]
+        onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), str(path))
         answers.append(open_model(path).run(picture)[0])
     assert np.array_equal(*answers)
 

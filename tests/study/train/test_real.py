@@ -1,7 +1,5 @@
 """The public sets that training reads: what is left out, what a class becomes, and scores that are calibrated."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -40,7 +38,6 @@ def pool(data, tmp_path_factory):
 
 
 def of_kind(pool, kind):
-    """The pictures of one set."""
     return [picture for name, (_, picture) in pool.items() if name.startswith(kind)]
 
 
@@ -57,9 +54,8 @@ def test_what_judges_is_never_trained_on(pool, data):
 def test_who_swims_is_a_person_and_what_floats_is_a_boat_or_nothing(pool):
     """Buoys would be boats, and the flight that is measured would be known by heart."""
     water = of_kind(pool, "water")
-    assert [picture.class_ids.tolist() for picture in water] == [
-        [ID["pedestrian"], ID["boat"], ID["boat"], -1]
-    ] * 2
+    own = [ID["pedestrian"], ID["boat"], ID["boat"], -1]
+    assert [picture.class_ids.tolist() for picture in water] == [own] * 2
 
 
 @pytest.mark.parametrize("date", JUDGED)
@@ -102,14 +98,11 @@ def test_madison_has_vehicles_our_marks_of_people_and_a_border_that_says_nothing
     assert with_people.class_ids.tolist().count(ID["pedestrian"]) == 4
     person = with_people.boxes_px[with_people.class_ids == ID["pedestrian"]][0]
     assert person == pytest.approx([314.6, 422.6, 345.7, 439.3], abs=0.01)
-    border = np.zeros((640, 640), bool)
+    border, wanted = np.zeros((2, 640, 640), bool)
     for x1, y1, x2, y2 in without.boxes_px[-4:].round().astype(int):
         border[y1:y2, x1:x2] = True
-    assert border[:26].all()
-    assert border[-26:].all()
-    assert border[:, :26].all()
-    assert border[:, -26:].all()
-    assert not border[26:-26, 26:-26].any()
+    wanted[:26] = wanted[-26:] = wanted[:, :26] = wanted[:, -26:] = True
+    assert (border == wanted).all()
 
 
 def test_of_a_field_all_but_the_marked_cars_is_ground(tmp_path):
@@ -133,9 +126,6 @@ def test_the_pool_gives_views_of_each_set(pool):
     assert {ID["car"], ID["pedestrian"], LARGE_VEHICLE, -1} <= kinds
 
 
-# --- calibration ---------------------------------------------------------------------------------------------------
-
-
 class Claims:
     """Finds boxes of known scores, of which a known share is right; judged classes are car and person."""
 
@@ -152,13 +142,11 @@ class Claims:
             right = rng.random(20) < true
             image = np.full((4, 4, 3), number % 256, np.uint8)
             image[0, 0] = number // 256
-            self.held_out.append(
-                HeldOut(image, boxes[right], np.zeros((0, 4), np.float32), frozenset({"car", "person"}))
-            )
+            nothing, judged = np.zeros((0, 4), np.float32), frozenset({"car", "person"})
+            self.held_out.append(HeldOut(image, boxes[right], nothing, judged))
             self.found[image.tobytes()] = Detections(boxes, scores, np.zeros(20, np.int32))
 
     def detect(self, image_bgr):
-        """What was made for this picture."""
         return self.found[image_bgr.tobytes()]
 
 
@@ -176,15 +164,10 @@ def test_a_known_line_is_found_and_scores_become_true(slope, shift):
     """A box of .9 would be right half of the time, and a still would confirm it."""
     claims = Claims(slope, shift, pictures=200)
     found = fit_calibration(claims, claims.held_out)
-    assert found.slope == pytest.approx(slope, abs=0.12)
-    assert found.shift == pytest.approx(shift, abs=0.12)
+    assert (found.slope, found.shift) == pytest.approx((slope, shift), abs=0.12)
     scores = np.concatenate([one.confidences for one in claims.found.values()])
-    right = np.concatenate(
-        [
-            np.isin(one.boxes_xyxy_px[:, 0], kept.boxes_px[:, 0])
-            for one, kept in zip(claims.found.values(), claims.held_out, strict=True)
-        ]
-    )
+    pairs = zip(claims.found.values(), claims.held_out, strict=True)
+    right = np.concatenate([np.isin(one.boxes_xyxy_px[:, 0], kept.boxes_px[:, 0]) for one, kept in pairs])
     fitted = 1 / (1 + np.exp(-(found.slope * np.log(scores / (1 - scores)) + found.shift)))
     assert error(fitted, right) < 0.03
     assert error(fitted, right) < error(scores, right) / 3

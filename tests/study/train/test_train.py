@@ -1,7 +1,5 @@
 """Training of the embedded models: pictures, labels, loss, export. What needs PyTorch is skipped without it."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -20,20 +18,13 @@ CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 
 @pytest.fixture(scope="module")
 def place():
-    """Draw one small place."""
     return draw_place(np.random.default_rng(3), size=512)
 
 
 def save(folder, picture, name="place-00000"):
-    """Write a picture as the pool does."""
     path = folder / f"{name}.npz"
-    np.savez(
-        path,
-        image=picture.image_bgr,
-        boxes=picture.boxes_px,
-        classes=picture.class_ids,
-        visible=picture.visible,
-    )
+    shown = {"boxes": picture.boxes_px, "classes": picture.class_ids, "visible": picture.visible}
+    np.savez(path, image=picture.image_bgr, **shown)
     return path
 
 
@@ -57,18 +48,11 @@ def test_a_place_seen_aslant_has_small_cars():
     assert 15 < np.median(sides[:, 0]) < 120
 
 
-@pytest.mark.parametrize("name", CLASSES)
-def test_every_class_can_be_made_and_has_its_size(name):
+@pytest.mark.parametrize(
+    ("name", "most"), list(zip(CLASSES, (5.3, 6.9, 12.1, 13.1, 2.4, 0.7, 12.3), strict=True))
+)
+def test_every_class_can_be_made_and_has_its_size(name, most):
     """A class would be missing from training, or as large as another one."""
-    most = {
-        "car": 5.3,
-        "van": 6.9,
-        "truck": 12.1,
-        "bus": 13.1,
-        "motor": 2.4,
-        "pedestrian": 0.7,
-        "other": 12.3,
-    }[name]
     lengths = []
     for seed in range(12):
         solid = make_solid(name, np.random.default_rng(seed))
@@ -133,9 +117,6 @@ def test_degrading_keeps_the_size_and_changes_the_picture():
     assert sum(not np.array_equal(one, image) for one in changed) >= 7
 
 
-# --- measuring -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -168,31 +149,24 @@ class Fixed:
     class_names = CLASSES
 
     def __init__(self, boxes, scores, kinds):
-        self.found = detections(boxes, scores, kinds)
-
-    def detect(self, image_bgr):
-        """Return what was given."""
-        return self.found
+        self.detect = lambda _: detections(boxes, scores, kinds)
 
 
-def test_average_precision_of_known_lists():
+@pytest.mark.parametrize(
+    ("right", "objects", "precision"),
+    [((1, 1, 1), 3, 1.0), ((1, 0, 1), 2, 0.5 + 0.5 * 2 / 3), ((0, 0, 0), 2, 0.0), ((), 2, 0.0)],
+)
+def test_average_precision_of_known_lists(right, objects, precision):
     """Every quality figure in the documentation would be wrong."""
-    scores = np.array([0.9, 0.8, 0.7], np.float32)
-    assert average_precision(scores, np.array([True, True, True]), 3) == pytest.approx(1.0)
-    assert average_precision(scores, np.array([True, False, True]), 2) == pytest.approx(0.5 + 0.5 * 2 / 3)
-    assert average_precision(scores, np.array([False, False, False]), 2) == 0.0
-    assert average_precision(scores[:0], np.array([], bool), 2) == 0.0
+    scores = np.array([0.9, 0.8, 0.7], np.float32)[: len(right)]
+    assert average_precision(scores, np.array(right, bool), objects) == pytest.approx(precision)
 
 
 def test_doubles_and_misses_cost_and_hidden_objects_do_not():
     """A detector that answers twice, or is punished for what nobody can see, would look other than it is."""
     boxes = np.array([[0, 0, 20, 20], [40, 0, 60, 20], [80, 0, 100, 20]], np.float32)
-    picture = Picture(
-        np.zeros((32, 128, 3), np.uint8),
-        boxes,
-        np.array([0, 0, 0], np.int32),
-        np.array([1, 1, 0.1], np.float32),
-    )
+    image, visible = np.zeros((32, 128, 3), np.uint8), np.array([1, 1, 0.1], np.float32)
+    picture = Picture(image, boxes, np.zeros(3, np.int32), visible)
     both = Fixed(boxes, [0.9, 0.8, 0.7], [0, 0, 0])
     assert evaluate_drawn(both, [picture]).by_class == {"car": pytest.approx(1.0)}
     doubled = Fixed([boxes[0], boxes[0], boxes[1]], [0.9, 0.8, 0.7], [0, 0, 0])
@@ -204,18 +178,13 @@ def test_doubles_and_misses_cost_and_hidden_objects_do_not():
 def test_real_agreement_counts_any_vehicle_and_no_person():
     """The figure on real pixels would depend on whether a pickup is called car or truck."""
     boxes = np.array([[0, 0, 20, 20], [40, 0, 60, 20], [80, 0, 100, 20]], np.float32)
-    result = evaluate_real(
-        Fixed(boxes, [0.9, 0.8, 0.7], [2, 1, 5]), [np.zeros((8, 8, 3), np.uint8)], [boxes[[0, 2]]]
-    )
+    found = Fixed(boxes, [0.9, 0.8, 0.7], [2, 1, 5])
+    result = evaluate_real(found, [np.zeros((8, 8, 3), np.uint8)], [boxes[[0, 2]]])
     assert (result.recall, result.precision, result.objects) == (0.5, 0.5, 2)
-
-
-# --- what needs PyTorch --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def torch():
-    """PyTorch, one thread, seeded."""
     torch = pytest.importorskip("torch")
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -224,7 +193,6 @@ def torch():
 
 @pytest.fixture
 def batch(torch, tmp_path, place):
-    """Eight views of one place."""
     from hvt_train.learning.train_detector import batch_of
 
     source = ViewSource([save(tmp_path, place)], seed=2, settings=ViewSettings(side=128))
@@ -265,9 +233,8 @@ def test_perfect_answers_cost_next_to_nothing(torch):
     assert loss.item() < 0.02
     ignored, _ = detector_loss(maps, Targets(torch.tensor([0]), target, torch.tensor([-1])))
     assert ignored.item() < 0.02
-    missed, _ = detector_loss(
-        maps, Targets(torch.tensor([]).long(), torch.zeros(0, 4), torch.tensor([]).long())
-    )
+    nothing = Targets(torch.tensor([]).long(), torch.zeros(0, 4), torch.tensor([]).long())
+    missed, _ = detector_loss(maps, nothing)
     assert missed.item() > 5
 
 

@@ -1,8 +1,17 @@
 """Labels and views written as rows, for tests of metrics."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from hvt_common.config import load
+from hvt_edge.config import EdgeConfig
+from hvt_edge.config import check as check_edge
+from hvt_ground.config import GroundConfig
+from hvt_ground.config import check as check_ground
 from hvt_study.datasets.labels import NO_ID, FrameLabels
+from hvt_study.datasets.sequence import Clip
+from hvt_study.flights.flight import FlightPlan
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.judged import FrameView, judged
 
@@ -40,3 +49,19 @@ def list_f1(report, frames, there):
         boxes, names = there(frame)
         pairs.append((labels(*zip(boxes, names, strict=True)), report.lists[frame].refined_view()))
     return class_score(judged(pairs)).f1
+
+
+def clip_of(pictures, folder):
+    """Pictures of one size as a clip whose pixels lie in that folder."""
+    path = folder / "clip.bgr"
+    path.write_bytes(np.stack(pictures).tobytes())
+    return Clip("drawn", pictures[0].shape[1::-1], len(pictures), path)
+
+
+def flight_plan(clip, *flags, link_bps=200_000):
+    """A flight over a clip at its own size, in which the ground's detector looks at every frame."""
+    usual = ("--source", "drawn", "--pace", "lockstep", "--size", "{}x{}".format(*clip.source_size))
+    words = [*usual, "--budget", "200kbps", "--preset", "ultrafast", *flags]
+    edge, _ = load(EdgeConfig, words, program="hvt-edge", description="")
+    ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
+    return FlightPlan(clip, check_edge(edge), ground, link_bps)

@@ -3,8 +3,6 @@
 Words of the edge's source may stand among the seeds: ``demo:0-4,codes,4k`` (`hvt_edge.source.demo`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 

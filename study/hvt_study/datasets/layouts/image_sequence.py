@@ -1,7 +1,5 @@
 """A sequence as a folder of numbered images, present and missing ones; and clips without labels."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Words

@@ -17,8 +17,6 @@ Where a file names its own classes, rows marked so are passed over. MOT15 has no
 and in place of class and visibility there is a place in the world, or -1,-1,-1.
 """
 
-from __future__ import annotations
-
 import configparser
 import math
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """The options behind a dataset's path in its URI: ``?fps=24&labels=none``."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Collection, Mapping

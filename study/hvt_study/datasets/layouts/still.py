@@ -5,8 +5,6 @@ ROOT/classes.txt), a folder of pictures with NAME.txt beside NAME.jpg, or a sing
 labels, and boxes that follow exactly; the way is drawn from a seed. See `hvt_study.datasets.virtual_camera`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path

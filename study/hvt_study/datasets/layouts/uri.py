@@ -1,7 +1,5 @@
 """One function opens every dataset: ``open_dataset("visdrone:/data/VisDrone2019-VID-val")``; another several."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Words
 from contextlib import contextmanager

@@ -19,8 +19,6 @@ Pixels count from 0. Where only ``_gt.txt`` is there, all objects are of class `
 without objects that leave the frame.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """Which rows of a study are compared with which: conditions, settings, arms, and pairs at matched totals."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -6,8 +6,6 @@ independent of each other, nor are seeds of one picture. Differences are drawn a
 (`hvt_study.report.data.pairs`): the difficulty of a sequence for both sides cancels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The parts of a report, before it is a page: sections of paragraphs, tables, drawings and pictures."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ curve is straight over the logarithm of the bitrate; where it goes down with mor
 video has shown as much.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

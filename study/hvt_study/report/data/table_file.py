@@ -1,7 +1,5 @@
 """``results.parquet``: one row a run; types and order as `hvt_study.runs.spec.COLUMNS` has them."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Mapping, Sequence

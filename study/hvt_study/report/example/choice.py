@@ -1,7 +1,5 @@
 """One flight of a study from close by: chosen by rule, with the results of its stills, second by second."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence

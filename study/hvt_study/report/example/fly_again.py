@@ -3,8 +3,6 @@
 The flight is the very same, to the bit; only the ground's side is asked to keep the pictures of its stills.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -31,15 +29,7 @@ from hvt_study.matrix.plan import StudyPlan
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.judged import judged
 from hvt_study.metrics.observed import refined_frames, refined_objects
-from hvt_study.report.example.choice import (
-    CropExample,
-    Example,
-    Lane,
-    Timeline,
-    Word,
-    percentile_rows,
-    png_of,
-)
+from hvt_study.report.example import choice
 from hvt_study.runs.run_context import RunContext, open_run_context
 from hvt_study.runs.run_settings import flight_plan
 from hvt_study.runs.spec import RunSpec
@@ -52,7 +42,7 @@ _BEST_DB = 99.0
 """Stands for a still without any loss."""
 
 
-def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> Example:
+def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> choice.Example:
     """Fly the run of `choose_run` once more; ``rule`` says why this one.
 
     Raises `UserError` where dataset or models cannot be used, or the edge refuses its settings.
@@ -63,7 +53,7 @@ def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> Example:
     return example_of(flight, context, key=spec.key, rule=rule, title=title)
 
 
-def example_of(flight: FlightPlan, context: RunContext, *, key: str, rule: str, title: str) -> Example:
+def example_of(flight: FlightPlan, context: RunContext, *, key: str, rule: str, title: str) -> choice.Example:
     """Fly, and look at it; `UserError` where the edge refuses its settings."""
     models = SharedModels(context.detector, context.classifier)
     again = Flight(
@@ -75,8 +65,8 @@ def example_of(flight: FlightPlan, context: RunContext, *, key: str, rule: str, 
     ground = again.ground
     report = again.report(saved_cpu_s=0.0)
     crops = list(_compared(ground.shown, flight.clip, view=ground.view))
-    rows = percentile_rows([crop.gain_db for crop in crops])
-    return Example(
+    rows = choice.percentile_rows([crop.gain_db for crop in crops])
+    return choice.Example(
         key=key,
         digest=report.digest,
         rule=rule,
@@ -127,7 +117,7 @@ class _WatchedGround(GroundSide):
         return watch
 
 
-def _compared(stills: Sequence[_Shown], clip: Clip, *, view: View) -> Iterator[CropExample]:
+def _compared(stills: Sequence[_Shown], clip: Clip, *, view: View) -> Iterator[choice.CropExample]:
     """Each still against the source frame that it was cut from; frames are read once, one at a time."""
     by_frame: dict[int, list[_Shown]] = {}
     for event, header in stills:
@@ -138,7 +128,7 @@ def _compared(stills: Sequence[_Shown], clip: Clip, *, view: View) -> Iterator[C
                 yield _crop(one, np.asarray(image), view=view)
 
 
-def _crop(one: _Shown, source_bgr: Image, *, view: View) -> CropExample:
+def _crop(one: _Shown, source_bgr: Image, *, view: View) -> choice.CropExample:
     event, header = one
     still, patch = event.still_bgr, event.base_crop_bgr
     assert still is not None, "only those with pixels are kept"
@@ -152,7 +142,7 @@ def _crop(one: _Shown, source_bgr: Image, *, view: View) -> CropExample:
         patch, view=_view_of(patch, header.crop_source_px, view), crop_source_px=(x1, y1, x2, y2), size=size
     )
     base_db, still_db = (min(_BEST_DB, psnr_y_db(image, source)) for image in (base, still))
-    return CropExample(
+    return choice.CropExample(
         percentile=0,
         gain_db=still_db - base_db,
         base_db=base_db,
@@ -161,9 +151,9 @@ def _crop(one: _Shown, source_bgr: Image, *, view: View) -> CropExample:
         class_before=event.class_before,
         class_after=event.class_after,
         size_bytes=len(event.still),
-        source_png=png_of(source),
-        base_png=png_of(base),
-        still_png=png_of(still),
+        source_png=choice.png_of(source),
+        base_png=choice.png_of(base),
+        still_png=choice.png_of(still),
     )
 
 
@@ -176,11 +166,11 @@ def _view_of(patch: Image, crop_source_px: tuple[int, int, int, int], view: View
 
 def _timeline(
     report: FlightReport, ground: _WatchedGround, context: RunContext, *, budget_bps: int
-) -> Timeline:
+) -> choice.Timeline:
     seconds = -(-len(report.lists) // _SECOND_FRAMES)
     kbps = _rates(ground.arrivals, started_ns=ground.started_ns, seconds=seconds)
     lanes = list(_lanes(report))
-    return Timeline(
+    return choice.Timeline(
         budget_bps=budget_bps,
         base_kbps=kbps["base"],
         roi_kbps=kbps["roi"],
@@ -222,17 +212,19 @@ def _scores(report: FlightReport, context: RunContext) -> dict[str, tuple[float,
     }
 
 
-def _lanes(report: FlightReport) -> Iterator[Lane]:
-    words: dict[int, list[Word]] = {}
+def _lanes(report: FlightReport) -> Iterator[choice.Lane]:
+    words: dict[int, list[choice.Word]] = {}
     for done in refined_objects(report.lists):
         if done.track_id != NO_ID:
-            words.setdefault(done.track_id, []).append(Word(done.at_s, done.name_before, done.name_after))
+            words.setdefault(done.track_id, []).append(
+                choice.Word(done.at_s, done.name_before, done.name_after)
+            )
     for track_id, said in words.items():
         listed = [bool((one.ids == track_id).any()) for one in report.lists]
-        yield Lane(track_id, tuple(_spans(listed)), tuple(said))
+        yield choice.Lane(track_id, tuple(_spans(listed)), tuple(said))
 
 
-def _interest(lane: Lane) -> tuple[int, int, int]:
+def _interest(lane: choice.Lane) -> tuple[int, int, int]:
     """Tracks whose class changed come first."""
     changes = sum(word.before != word.after for word in lane.words)
     return -changes, -len(lane.words), lane.track_id

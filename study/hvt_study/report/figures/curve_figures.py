@@ -1,7 +1,5 @@
 """Curves: utility over bitrate, and those of the still codecs."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

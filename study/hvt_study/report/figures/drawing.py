@@ -3,8 +3,6 @@
 The rate-utility plot of a comparison: utility over the bits that were really spent.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """A flight from close by: stills beside source and base, and how it went, second by second."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures of pairs: differences at matched totals, and the bits that video needs to show as much; one a regime."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
