@@ -4,18 +4,15 @@
 (bars.py) is missed.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
-import json
 import sys
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from bench.bars import measured
+from lab.link.measures.rows import save, table
 
 PARTS = ("light", "memory", "latency", "pipeline", "joining", "tracker", "detector", "batching", "providers")
 
@@ -27,27 +24,16 @@ def main(argv: list[str]) -> int:
     for part in parts:
         if part not in PARTS:
             parser.error(f"{part} is not known: choose from {', '.join(PARTS)}")
-    console = Console(highlight=False)
-    table = Table(title="make bench", title_justify="left")
-    for name in ("part", "measure", "value", "bar", "holds"):
-        table.add_column(name, justify="left" if name in ("part", "measure") else "right")
-    found = []
+    console, found = Console(highlight=False), []
     for part in parts:
         with console.status(f"{part} …"):
             try:
                 rows = importlib.import_module(f"bench.{part}").rows()
             except ImportError as error:
                 rows = [measured(f"left out: {error}", None)]
-        for row in rows:
-            found.append({"part": part, **row})
-            holds = {True: "yes", False: "NO", None: ""}[row["holds"]]
-            value, bar = row["value"], row["bar"]
-            shown = f"{value:.3f}" if isinstance(value, float) else str("" if value is None else value)
-            table.add_row(part, row["measure"], shown, str("" if bar is None else bar), holds)
-    console.print(table)
-    out = Path("build/bench.json")
-    out.parent.mkdir(exist_ok=True)
-    out.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        found += [{"part": part, **row} for row in rows]
+    console.print(table(found, title="make bench"))
+    save(found, Path("build/bench.json"))
     missed = [f"{row['part']}: {row['measure']}" for row in found if row["holds"] is False]
     for one in missed:
         print(f"bench: missed its bar: {one}", file=sys.stderr)

@@ -5,8 +5,6 @@ The model takes one picture; of a copy the batch is freed. The embedded detector
 measured: the sizes inside it are of one picture.
 """
 
-from __future__ import annotations
-
 import statistics
 import tempfile
 import time
@@ -75,8 +73,3 @@ def _with_free_batch(shape: onnx.TensorProto) -> onnx.TensorProto:
     sizes = numpy_helper.to_array(shape).copy()
     sizes[0] = 0
     return numpy_helper.from_array(sizes, shape.name)
-
-
-if __name__ == "__main__":
-    for one in rows():
-        print(one)

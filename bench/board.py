@@ -5,8 +5,6 @@ board, memory and heat, are not tried. Ends with code 1 where a bar is missed: n
 processor time, no box is older than a second and a half, and the doctor's forecast is right within a fifth.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -26,7 +24,7 @@ import cv2
 
 from bench.bars import measured
 from bench.support.material import frames
-from bench.support.processes import free_endpoint, running
+from bench.support.processes import cpu_s, free_endpoint, running
 
 _SHARE, _CORES = 0.25, 2
 _PERIOD_US = 100_000
@@ -76,7 +74,7 @@ def _rows(folder: Path, hold: Hold) -> list[dict[str, object]]:
                 state = json.loads(urlopen(f"http://{address}/state.json", timeout=5).read())
                 if state["state"] == "running" and state["boxes_age_s"] is not None:
                     ages.append(state["boxes_age_s"])
-                    spent = (time.monotonic(), _processor_s(edge.pid))
+                    spent = (time.monotonic(), cpu_s(edge))
                     began = began or spent
     content = json.loads(summary.read_text())
     needed = (spent[1] - began[1]) / (spent[0] - began[0])
@@ -108,11 +106,6 @@ def _forecast(settings: tuple[object, ...], hold: Hold) -> float:
     found = re.search(r"about ([\d.]+) cores", findings["processor"]["found"])
     assert found is not None, findings
     return float(found[1])
-
-
-def _processor_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _by_group(stack: contextlib.ExitStack) -> Hold | None:

@@ -4,17 +4,15 @@ Writes build/compare/CLIP.json and CLIP.png.
 ``python -m bench.compare [CLIP …]``: carpark, highway (reference labels), street (exact labels), or all.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from itertools import pairwise
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
@@ -23,6 +21,7 @@ from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.compare import print_result
 from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow, compare
 from hvt_study.matrix.pools import local_pool
+from hvt_study.report.data.pairs import needed_bps
 from hvt_study.report.figures.drawing import plot
 from hvt_study.runs.spec import ModelChoice
 
@@ -103,11 +102,13 @@ def _half_the_bits(rows: dict[tuple[str, float], CompareRow]) -> Iterator[Goal]:
     for rate in (300.0, 400.0, 800.0):  # half of less lies below the lowest rate
         goal = f"M6 needs at most 0.5 of the bits of M0-fps at {rate:g} kbps for its class agreement"
         row = rows.get(("M0-fps", rate))
-        needed = None if row is None else _bits_for(row["class_agreement"], _curve(rows, "M6"))
-        if row is None or not _curve(rows, "M6"):
+        points = [(one["total_bps"], one["class_agreement"]) for one in _curve(rows, "M6")]
+        if row is None or len(points) < 2:
             yield goal, "a method is missing", None
-        elif needed is None:
-            best = max(one["class_agreement"] for one in _curve(rows, "M6"))
+            continue
+        needed = max(needed_bps(points, level=row["class_agreement"]), points[0][0])
+        if math.isinf(needed):
+            best = max(agreement for _, agreement in points)
             yield goal, f"M6 never reaches {row['class_agreement']:.3f} (best {best:.3f})", False
         else:
             share = needed / row["total_bps"]
@@ -144,7 +145,7 @@ def _never_worse(rows: dict[tuple[str, float], CompareRow]) -> Goal:
     gains: list[tuple[float, str, float]] = []
     for row in theirs:
         for measure in ("f1", "class_agreement"):
-            value = _value_at(row["total_bps"], mine, lambda one, of=measure: float(one[of]))
+            value = _value_at(row["total_bps"], mine, measure)
             if value is not None:
                 gains.append((value - row[measure], measure, row["rate_kbps"]))
     least, measure, rate = min(gains)
@@ -157,30 +158,12 @@ def _curve(rows: dict[tuple[str, float], CompareRow], method: str) -> list[Compa
     )
 
 
-def _bits_for(agreement: float, curve: list[CompareRow]) -> float | None:
-    """The fewest bits at which a curve reaches a class agreement, straight lines over the logarithm of the bits."""
-    for index, row in enumerate(curve):
-        if row["class_agreement"] < agreement:
-            continue
-        if index == 0:
-            return row["total_bps"]
-        before = curve[index - 1]
-        part = (agreement - before["class_agreement"]) / (row["class_agreement"] - before["class_agreement"])
-        low, high = math.log(before["total_bps"]), math.log(row["total_bps"])
-        return math.exp(low + part * (high - low))
-    return None
-
-
-def _value_at(bps: float, curve: list[CompareRow], value: Callable[[CompareRow], float]) -> float | None:
-    """The value of a curve at so many bits; None below its beginning, its last value beyond its end."""
-    if bps < curve[0]["total_bps"]:
-        return value(curve[0]) if bps > 0.97 * curve[0]["total_bps"] else None
-    for low, high in pairwise(curve):
-        if low["total_bps"] <= bps <= high["total_bps"]:
-            span = math.log(high["total_bps"] / low["total_bps"])
-            part = math.log(bps / low["total_bps"]) / span if span else 0.0
-            return value(low) + part * (value(high) - value(low))
-    return value(curve[-1])
+def _value_at(bps: float, curve: list[CompareRow], measure: str) -> float | None:
+    """A measure of a curve at so many bits; None below its beginning, its last value beyond its end."""
+    totals = [row["total_bps"] for row in curve]
+    if bps <= 0.97 * totals[0]:
+        return None
+    return float(np.interp(math.log(bps), np.log(totals), [row[measure] for row in curve]))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """A ground that comes late, on loopback: how soon it has a picture, and how long each side takes to end."""
 
-from __future__ import annotations
-
 import csv
 import signal
 import subprocess
@@ -34,20 +32,10 @@ def _joined() -> tuple[list[float], list[float], float]:
     pictures_s, grounds_s = [], []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with running(
-            *(
-                "hvt_edge.cli",
-                "--source",
-                _long_clip(folder),
-                "--listen",
-                endpoint,
-                "--wait",
-                "0s",
-                "--quiet",
-            ),
-            # No keyframe but those that are asked for.
-            *("--detector", nano(), "--keyframe-interval", "0s"),
-        ) as edge:
+        words = ("--source", _long_clip(folder), "--listen", endpoint, "--wait", "0s", "--quiet")
+        # No keyframe but those that are asked for.
+        rare = ("--detector", nano(), "--keyframe-interval", "0s")
+        with running("hvt_edge.cli", *words, *rare) as edge:
             for number in range(_GROUNDS):
                 timing = folder / f"{number}.csv"
                 with running(
@@ -84,8 +72,3 @@ def _end_s(process: subprocess.Popen) -> float:
     process.send_signal(signal.SIGINT)
     process.wait(_PATIENCE_S)
     return time.monotonic() - began_s
-
-
-if __name__ == "__main__":
-    for one in rows():
-        print(one)

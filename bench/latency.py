@@ -4,8 +4,6 @@ Once with a core for each side, as two machines would have, and once with all co
 both sides collide.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile
@@ -15,12 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.bars import measured
-from bench.support.material import FPS, SIZE, clip, frames, nano
+from bench.support.material import clip, encoder, frames, nano
 from bench.support.processes import Peaks, free_endpoint, pin_to, running
 from hvt_common.inference.detect import open_detector
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder import encoder_settings
-from hvt_edge.video.x265 import BaseEncoder
 
 
 def rows() -> list[dict[str, object]]:
@@ -44,16 +40,11 @@ def rows() -> list[dict[str, object]]:
 
 def _floor_ms() -> float:
     """The 95th percentile of one frame's encode, decode and detector call, one after the other."""
-    encoder = BaseEncoder(
-        encoder_settings(
-            size=SIZE, fps=FPS, preset="veryfast", total_bps=800_000, base_bps=650_000, edge_id="edge-1"
-        )
-    )
-    decoder, detector = BaseDecoder(), open_detector(str(nano()), provider="auto")
+    coder, decoder, detector = encoder(), BaseDecoder(), open_detector(str(nano()), provider="auto")
     took = []
     for frame in frames(150):
         began = time.perf_counter()
-        detector.detect(decoder.decode(encoder.encode(frame).data))
+        detector.detect(decoder.decode(coder.encode(frame).data))
         took.append((time.perf_counter() - began) * 1e3)
     return float(np.percentile(took[5:], 95))
 
@@ -76,8 +67,3 @@ def _p95_ms(cores: tuple[int | None, int | None]) -> float:
             peaks.until_ended(edge, patience_s=120)
             peaks.until_ended(ground, patience_s=60)
         return float(json.loads(summary.read_text())["latency_ms"]["p95"])
-
-
-if __name__ == "__main__":
-    for one in rows():
-        print(one)

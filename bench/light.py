@@ -1,16 +1,12 @@
 """The processor time of an edge beyond the necessary: at its start, with video alone, by default."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys
 import time
 
 from bench.bars import measured
-from bench.support.material import FPS, SIZE, clip, frames
-from hvt_edge.video.encoder import encoder_settings
-from hvt_edge.video.x265 import BaseEncoder
+from bench.support.material import SIZE, clip, encoder, frames
 
 _FRAMES = 100
 _FIRST = 20
@@ -45,14 +41,10 @@ def _bare_s() -> float:
     began_s = time.process_time()
     taken = frames(_FRAMES)
     read_s = time.process_time() - began_s
-    encoder = BaseEncoder(
-        encoder_settings(
-            size=SIZE, fps=FPS, preset="veryfast", total_bps=800_000, base_bps=800_000, edge_id="edge-1"
-        )
-    )
+    coder = encoder(base_bps=800_000)
     began_s = time.process_time()
     for frame in taken:
-        encoder.encode(frame)
+        coder.encode(frame)
     return (read_s + time.process_time() - began_s) / len(taken)
 
 
@@ -79,8 +71,3 @@ def _spent_s(*arguments: str) -> float:
     subprocess.run([sys.executable, *arguments], check=False, stdout=subprocess.DEVNULL, timeout=300)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
-if __name__ == "__main__":
-    for one in rows():
-        print(one)

@@ -4,8 +4,6 @@ defaults; then a ground of one edge and of eight.
 The eight are played from this process: access units of 640x360 at 5 fps, coded once, over eight Zenoh sessions.
 """
 
-from __future__ import annotations
-
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -97,8 +95,3 @@ def _played(count: int) -> _Peak:
         peaks = Peaks([ground])
         played(stack, count, endpoint, units, fps=_FPS, lasts_s=_PLAYED_S, on_round=peaks.sample)
     return _peaks_of(peaks)[0]
-
-
-if __name__ == "__main__":
-    for one in rows():
-        print(one)

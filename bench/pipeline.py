@@ -5,9 +5,6 @@ as many detector calls as it made, with the conversion of those pictures to BGR.
 camera motion, methods, stills, headers, ledger and the recording, and may win time back by doing things side by side.
 """
 
-from __future__ import annotations
-
-import os
 import subprocess
 import sys
 import tempfile
@@ -15,7 +12,7 @@ import time
 from pathlib import Path
 
 from bench.bars import measured
-from bench.support.material import FPS, SIZE, clip, frames, nano
+from bench.support.material import FPS, SIZE, clip, encoder, frames, nano
 from hvt_common import __version__
 from hvt_common.inference.detect import open_detector, warm_up
 from hvt_common.protocol.messages import BaseHeader, Flags, Info
@@ -24,8 +21,6 @@ from hvt_common.runtime.process import limit_malloc_arenas, put_video_first
 from hvt_common.transport.inbox import Received
 from hvt_common.values import AccessUnit, View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder import encoder_settings
-from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.session.session import Session
@@ -60,12 +55,9 @@ def rows() -> list[dict[str, object]]:
 
 
 def _bare_encode(taken) -> tuple[float, list[AccessUnit]]:
-    settings = encoder_settings(
-        size=SIZE, fps=FPS, preset="veryfast", total_bps=800_000, base_bps=650_000, edge_id="edge-1"
-    )
-    encoder = BaseEncoder(settings)
+    coder = encoder()
     began = time.perf_counter()
-    units = [encoder.encode(frame) for frame in taken]
+    units = [coder.encode(frame) for frame in taken]
     return (time.perf_counter() - began) / len(taken), units
 
 
@@ -85,23 +77,11 @@ def _edge() -> float:
     """Seconds a frame of hvt-edge in lockstep; start-up is taken off by running two lengths."""
     took = {}
     for count in (20, 20 + _FRAMES):
-        command = [
-            sys.executable,
-            "-m",
-            "hvt_edge.cli",
-            "--source",
-            clip(),
-            "--detector",
-            nano(),
-            "--quiet",
-            "--method",
-            "M5",
-        ]
-        command += ["--pace", "lockstep", "--wait", "0s", "--max-frames", str(count)]
+        command = [sys.executable, "-m", "hvt_edge.cli", "--source", clip(), "--detector", nano(), "--quiet"]
+        command += ["--method", "M5", "--pace", "lockstep", "--wait", "0s", "--max-frames", str(count)]
+        command += ["--connect", "tcp/127.0.0.1:9"]
         began = time.perf_counter()
-        done = subprocess.run(
-            [*command, "--connect", "tcp/127.0.0.1:9"], check=False, stdout=subprocess.DEVNULL
-        )
+        done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL)
         assert done.returncode == 1, "nobody listens"
         took[count] = time.perf_counter() - began
     return (took[20 + _FRAMES] - took[20]) / _FRAMES
@@ -174,9 +154,3 @@ def _recorder_settings(path: Path, info: Info) -> RecorderSettings:
         budget_bps=info.budget_bps,
         clocked=False,
     )
-
-
-if __name__ == "__main__":
-    for one in rows():
-        print(one)
-    os._exit(0)

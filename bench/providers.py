@@ -1,4 +1,4 @@
-"""The time of each execution provider, and its change of results: `python bench/providers.py`.
+"""The time of each execution provider, and its change of results: `python -m bench providers`.
 
 Speed: median ms of the bare network, providers in turn on the same input, so that a busy machine slows all alike.
 Change: on frames of the drone clip, F1 at IoU 0.5 with the same class, against the same network on cpu
@@ -6,25 +6,22 @@ Change: on frames of the drone clip, F1 at IoU 0.5 with the same class, against 
 such bar: ``auto`` runs it on cpu, and docs/models.md has a table of the cost of others.
 """
 
-from __future__ import annotations
-
-import os
 import statistics
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from bench.bars import measured
+from bench.support.material import data
+from bench.support.processes import ms
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
-from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import embedded_models
 from hvt_common.values import Detections, Image, iou
 
-DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 MODELS = (
     ("yolox_nano", (1, 3, 384, 640), 25),
     ("yolov5su_visdrone_640", (1, 3, 640, 640), 9),
@@ -40,7 +37,7 @@ def rows() -> list[dict]:
     providers = available()
     result = []
     for name, shape, rounds in (*MODELS, CLASSIFIER):
-        times = _times(DATA / f"models/{name}.onnx", shape, rounds, providers)
+        times = _times(data() / f"models/{name}.onnx", shape, rounds, providers)
         size = f"{shape[3]}x{shape[2]}"
         result.append(measured("cpu, ms", times["cpu"][0], of=f"{name} {size}"))
         for provider in providers[1:]:
@@ -48,7 +45,7 @@ def rows() -> list[dict]:
             result.append(measured(f"{provider}, ms", ms, of=f"{name} {size}"))
             result.append(measured("provider / cpu, time", ratio, of=f"{name} {size}, {provider}"))
     images = _frames()
-    models = {name: str(DATA / f"models/{name}.onnx") for name in COMPARED}
+    models = {name: str(data() / f"models/{name}.onnx") for name in COMPARED}
     models |= {name: name for name in embedded_models() if name == EMBEDDED}
     for name, spec in models.items():
         for provider in providers[1:]:
@@ -63,7 +60,7 @@ def available() -> tuple[str, ...]:
     for provider in PROVIDERS:
         if provider not in ("cpu", "auto"):
             try:
-                open_model(DATA / "models/yolox_nano.onnx", settings=ModelSettings(provider=provider))
+                open_model(data() / "models/yolox_nano.onnx", settings=ModelSettings(provider=provider))
             except UserError:
                 continue
             found.append(provider)
@@ -82,7 +79,7 @@ def _times(
     times = {name: [] for name in providers}
     for _ in range(rounds):
         for name, model in models.items():
-            times[name].append(_ms(model, feed))
+            times[name].append(ms(lambda model=model: model.run(feed)))
     return {
         name: (
             statistics.median(times[name]),
@@ -92,14 +89,8 @@ def _times(
     }
 
 
-def _ms(model: OnnxModel, feed: np.ndarray) -> float:
-    start = time.perf_counter()
-    model.run(feed)
-    return (time.perf_counter() - start) * 1e3
-
-
 def _frames() -> list[Image]:
-    clip = cv2.VideoCapture(str(DATA / "clips/drone_carpark.mp4"))
+    clip = cv2.VideoCapture(str(data() / "clips/drone_carpark.mp4"))
     images = []
     for index in FRAMES:
         clip.set(cv2.CAP_PROP_POS_FRAMES, index)
@@ -131,8 +122,3 @@ def _matches(expected: Detections, found: Detections) -> int:
             free[overlap.argmax()] = False
             count += 1
     return count
-
-
-if __name__ == "__main__":
-    for one in rows():
-        print(one)

@@ -7,11 +7,8 @@ KL(answer on the pristine crop || answer on the still) is that of JPEG q65, with
 line is straight in the logarithm of bytes.
 """
 
-from __future__ import annotations
-
 import io
 import json
-import math
 import random
 import statistics
 import sys
@@ -33,6 +30,7 @@ from hvt_common.video.still_codecs import StillCodec, psnr_y_db, still_codec, st
 from hvt_edge.perception.candidates import PADDING, crop_box
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
+from hvt_study.report.data.pairs import needed_bps
 
 KBPS = (800, 400)
 TAKEN = range(12, 150, 18)
@@ -199,15 +197,8 @@ def _score(label: str, codec: StillCodec, material: list[Pair], reference: Point
 
 def _crossing(line: list[tuple[float, float]], target: float) -> float:
     """Bytes where quality, the first of each point, first reaches the target; the ends are not stretched."""
-    before = line[0]
-    for point in line:
-        if point[0] >= target:
-            if point is line[0] or point[0] == before[0]:
-                return point[1]
-            share = (target - before[0]) / (point[0] - before[0])
-            return math.exp((1 - share) * math.log(before[1]) + share * math.log(point[1]))
-        before = point
-    return line[-1][1]
+    reached = needed_bps([(size, quality) for quality, size in line], level=target)
+    return min(max(reached, line[0][1]), line[-1][1])
 
 
 def _point(sizes: list[int], images: list[Image], crops: list[Image], judge: Judge) -> Point:

@@ -4,8 +4,6 @@ Run ``python -m bench.tracker``. `trackers` is no dependency of the project: ins
 own and run this module with that Python and ``PYTHONPATH=common:.``.
 """
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable

@@ -5,8 +5,6 @@ once, each loss and each return between. At the end stand both tables, and rows 
 the disk needs the right to mount; without it that loss is left out, with the reason.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import math
@@ -110,7 +108,6 @@ class Flight:
         self._row(loss, "frames a second afterwards", after, _LEAST_FPS)
 
     def watch(self, seconds: float) -> None:
-        """Print the output for so long."""
         until_s = time.monotonic() + seconds
         while time.monotonic() < until_s:
             self._print()
@@ -130,7 +127,6 @@ class Flight:
         return {name: len(side.said) for name, side in self.sides.items()}
 
     def _named(self, said: Sequence[tuple[str, str]], from_: dict[str, int]) -> int:
-        """How many of these are said soon."""
         found: set[tuple[str, str]] = set()
         until_s = time.monotonic() + _SOON_S
         while len(found) < len(said) and time.monotonic() < until_s:
@@ -277,7 +273,6 @@ def _disk(folder: Path, console: Console) -> Iterator[bool]:
 
 
 def _fill(folder: Path) -> None:
-    """Until nothing is left."""
     with (folder / _BALLAST).open("wb", buffering=0) as file:
         for size in (1 << 20, 1 << 12):
             with contextlib.suppress(OSError):

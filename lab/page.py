@@ -4,8 +4,6 @@ A flight over loopback and headless Chromium on this machine. Glass to glass: fr
 handed to the screen, both by this machine's clock. The further viewers read the same as a browser, and show nothing.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil
@@ -34,7 +32,6 @@ _NOTE_AGES = """() => {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Fly once; print a line a measurement."""
     parser = argparse.ArgumentParser(prog="python -m lab.page", description=__doc__)
     parser.add_argument("source", help="what hvt-edge --source takes")
     parser.add_argument("--size", default="1280x720")

@@ -8,8 +8,6 @@ leaves, how long it took until each edge was served again, and the router's proc
 namespaces.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess
@@ -160,7 +158,6 @@ def _over(counter: Callable[[], int]) -> float:
 
 
 def main(words: list[str]) -> None:
-    """One row a fleet."""
     if words and words[0] == "members":
         _members(words[1], int(words[2]), int(words[3]))
     elif words and words[0] == "edges":

@@ -4,8 +4,6 @@ Who follows one of them by reading opens so many files. Codecs of stills are not
 The flight lasts until the command has reached the encoder and some stills have gone, however busy the machine is.
 """
 
-from __future__ import annotations
-
 import socket
 import sys
 import tempfile

@@ -6,12 +6,9 @@ that it took, their ratio, the share of frames passed over for lack of time at t
 (fair where they are alike), capture to overlay at the worst one, and peak memory.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack
@@ -23,7 +20,7 @@ from rich.progress import track
 from rich.table import Table
 
 from bench.fleet.played import SIZE, coded, played
-from bench.support.processes import Peaks, free_endpoint, running
+from bench.support.processes import Peaks, cpu_s, free_endpoint, running
 from hvt_edge.source.opening import open_source
 
 COUNTS = (1, 2, 4, 8, 16)
@@ -85,14 +82,13 @@ def _served(count: int, units: list) -> Served:
             "--summary",
             folder / "s.json",
         )
-        ground = stack.enter_context(
-            running("hvt_ground.cli", *words, "--provider", "cpu", "--detect-every", "3", "--patience", "2s")
-        )
+        words += ("--provider", "cpu", "--detect-every", "3", "--patience", "2s")
+        ground = stack.enter_context(running("hvt_ground.cli", *words))
         peaks, spent = Peaks([ground]), []
 
         def on_round() -> None:
             peaks.sample()
-            spent.append(_cpu_s(ground))
+            spent.append(cpu_s(ground))
 
         with ExitStack() as edges:
             played(edges, count, endpoint, units, fps=_FPS, lasts_s=_PLAYED_S, on_round=on_round)
@@ -109,12 +105,6 @@ def _served(count: int, units: list) -> Served:
         delay_p95_ms=max(one["latency_ms"]["p95"] or 0.0 for one in said),
         peak_mb=peaks.mb[0],
     )
-
-
-def _cpu_s(process: subprocess.Popen) -> float:
-    """User and system time so far."""
-    words = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

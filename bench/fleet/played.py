@@ -3,8 +3,6 @@
 So the edges take next to nothing of the machine that the ground is measured on.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack

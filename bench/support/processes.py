@@ -1,7 +1,5 @@
 """Edge and ground as processes of their own: pinned where wanted, with their peaks of memory and threads."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -9,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 
@@ -69,8 +67,20 @@ class Peaks:
             time.sleep(0.1)
 
 
+def cpu_s(process: subprocess.Popen) -> float:
+    """User and system time so far."""
+    words = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def pin_to(cores: set[int]) -> set[int]:
     """Pin this process, and the threads that it starts from now on; return the cores that it could use before."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)
     return before
+
+
+def ms(call: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    call()
+    return (time.perf_counter() - start) * 1e3

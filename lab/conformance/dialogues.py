@@ -1,7 +1,5 @@
 """Vectors of a ground's results: reports, objects of the backlog from their chunks, sizes of stills."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Vectors are as good as the faults that they find: each mutant must fail one of them.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -65,7 +63,6 @@ def survivors(reader: Path, mutants: Sequence[Mutant] = MUTANTS, *, vectors: Pat
 
 
 def main() -> int:
-    """Say which survive; 1 where one does."""
     with tempfile.TemporaryDirectory() as folder:
         alive = survivors(built(Path(folder)))
     for one in alive:

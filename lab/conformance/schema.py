@@ -3,68 +3,48 @@
 The lists of docs/wire-messages.md are checked against it, and the reader in TypeScript reads its fields from it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from hvt_common.protocol.messages import (
-    MAX_BACKLOG_BYTES,
-    MAX_PAYLOAD_BYTES,
-    MOST_UNKNOWN_FIELDS,
-    SPOKEN_VERSIONS,
-    WIRE_VERSION,
-    BacklogHeader,
-    BacklogStill,
-    BacklogUnit,
-    BaseHeader,
-    ControlAnswer,
-    ControlRequest,
-    Feedback,
-    Info,
-    InfoRequest,
-    Message,
-    PoseReport,
-    Status,
-    StillWire,
-    TrackStep,
-    kinds,
-)
+from hvt_common.protocol import messages as wire
 from hvt_common.protocol.messages.envelope import DEEPEST, Nested
 from hvt_common.protocol.messages.fields import REFUSED_CHARACTERS, Kind, ListOf
 from hvt_common.protocol.messages.track_boxes import MOST_BOXES, MOST_CLASSES
 
 PATH = Path(__file__).resolve().parents[2] / "docs" / "wire.json"
 _PARTS = {8: "eighths", 10: "tenths", 100: "hundredths", 1000: "thousandths"}
-MESSAGES: tuple[type[Message], ...] = (
-    BaseHeader,
-    StillWire,
-    BacklogHeader,
-    Info,
-    TrackStep,
-    PoseReport,
-    Status,
-    InfoRequest,
-    ControlRequest,
-    ControlAnswer,
-    Feedback,
+MESSAGES: tuple[type[wire.Message], ...] = (
+    wire.BaseHeader,
+    wire.StillWire,
+    wire.BacklogHeader,
+    wire.Info,
+    wire.TrackStep,
+    wire.PoseReport,
+    wire.Status,
+    wire.InfoRequest,
+    wire.ControlRequest,
+    wire.ControlAnswer,
+    wire.Feedback,
 )
 
 
 def schema() -> dict[str, Any]:
     """All of it; a value without an exact JSON number stays a whole number here."""
     nested = {
-        one.__name__: one for message in MESSAGES for _, kind in kinds(message) for one in nested_of(kind)
+        one.__name__: one
+        for message in MESSAGES
+        for _, kind in wire.kinds(message)
+        for one in nested_of(kind)
     }
     return {
-        "version": WIRE_VERSION,
-        "reads": list(SPOKEN_VERSIONS),
+        "version": wire.WIRE_VERSION,
+        "reads": list(wire.SPOKEN_VERSIONS),
         "limits": {
-            "payload_bytes": MAX_PAYLOAD_BYTES,
-            "object_bytes": MAX_BACKLOG_BYTES,
-            "unknown_fields": MOST_UNKNOWN_FIELDS,
+            "payload_bytes": wire.MAX_PAYLOAD_BYTES,
+            "object_bytes": wire.MAX_BACKLOG_BYTES,
+            "unknown_fields": wire.MOST_UNKNOWN_FIELDS,
             "depth": DEEPEST,
             "tracks": MOST_BOXES,
             "classes": MOST_CLASSES,
@@ -79,13 +59,14 @@ def schema() -> dict[str, Any]:
             for one in MESSAGES
         },
         "nested": {name: {"fields": list(_fields(one))} for name, one in nested.items()},
-        "objects": {one.__name__: {"fields": list(_fields(one))} for one in (BacklogStill, BacklogUnit)},
+        "objects": {
+            one.__name__: {"fields": list(_fields(one))} for one in (wire.BacklogStill, wire.BacklogUnit)
+        },
     }
 
 
-def name_of(message: type[Message]) -> str:
-    """As the pages call it."""
-    return "RoiHeader" if message is StillWire else message.__name__
+def name_of(message: type[wire.Message]) -> str:
+    return "RoiHeader" if message is wire.StillWire else message.__name__
 
 
 def nested_of(kind: Kind) -> Iterator[type]:

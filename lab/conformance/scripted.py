@@ -1,7 +1,5 @@
 """Steps of tracks and reports of poses that no encoder makes: each number is given, in the order of the page."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from unittest.mock import patch

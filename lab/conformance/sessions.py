@@ -1,21 +1,12 @@
 """Vectors that are sessions: reports of tracks and poses that build on each other, some damaged, some missing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
 
-from hvt_common.protocol.messages import (
-    PoseDecoder,
-    PoseEncoder,
-    PoseReport,
-    TrackStep,
-    TrackStepEncoder,
-    WireError,
-)
+from hvt_common.protocol import messages as wire
 from hvt_common.protocol.messages.bits import BitWriter
 from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
 from hvt_common.values import Orientation, Pose, Tracks
@@ -56,7 +47,7 @@ def _scripted(script: list[Step]) -> Iterator[dict[str, Any]]:
     for sequence, (frame, builds, numbers) in enumerate(script):
         before, frames = (state if builds else None), frame - last[1]
         boxes = written(numbers, reference=before, frames=frames)
-        step = TrackStep(
+        step = wire.TrackStep(
             session_id=1,
             sequence=sequence,
             frame_index=frame,
@@ -68,7 +59,7 @@ def _scripted(script: list[Step]) -> Iterator[dict[str, Any]]:
         found: dict[str, Any] = {"hex": step.pack().hex()}
         try:
             state = read_tracks(boxes, reference=before, frames=frames)
-        except WireError:
+        except wire.WireError:
             yield found | {"damaged": True}
             continue
         last = sequence, frame
@@ -76,7 +67,7 @@ def _scripted(script: list[Step]) -> Iterator[dict[str, Any]]:
 
 
 def _session(count: int, steps: int, *, session_id: int = 2**63 + 5) -> Iterator[dict[str, Any]]:
-    encoder = TrackStepEncoder(session_id=session_id, refresh_ns=1_500_000_000)
+    encoder = wire.TrackStepEncoder(session_id=session_id, refresh_ns=1_500_000_000)
     state: list[CodedTrack] = []
     frame = -1
     for number in range(steps):
@@ -108,7 +99,7 @@ def _tracks(count: int, number: int) -> Tracks:
 
 
 def _damaged() -> Iterator[dict[str, Any]]:
-    encoder = TrackStepEncoder(session_id=1)
+    encoder = wire.TrackStepEncoder(session_id=1)
     first = encoder.encode(_tracks(5, 0), capture_ns=10**18)
     second = encoder.encode(_tracks(5, 1), capture_ns=10**18 + 333_333_333)
     state = _read(first, [], before=-1)
@@ -117,7 +108,7 @@ def _damaged() -> Iterator[dict[str, Any]]:
         step = replace(second, boxes=boxes)
         try:
             _read(step, state, before=first.frame_index)
-        except WireError:
+        except wire.WireError:
             yield {"hex": step.pack().hex(), "damaged": True}
     yield {"hex": replace(second, frame_index=0).pack().hex(), "damaged": True}
     for frame_index in (second.frame_index, 0):
@@ -128,7 +119,7 @@ def _damaged() -> Iterator[dict[str, Any]]:
     yield {"hex": second.pack().hex(), "tracks": _rows(_read(second, state, before=first.frame_index))}
 
 
-def _read(step: TrackStep, state: list[CodedTrack], *, before: int) -> list[CodedTrack]:
+def _read(step: wire.TrackStep, state: list[CodedTrack], *, before: int) -> list[CodedTrack]:
     reference = None if step.reference < 0 else state
     return read_tracks(step.boxes, reference=reference, frames=step.frame_index - before)
 
@@ -155,13 +146,13 @@ def poses() -> Iterator[dict[str, Any]]:
         for second in range(6)
     ]
     place = [Pose((5_000 + 1_000 * second) * 1_000_000, -33.8568, 151.2153) for second in range(3)]
-    encoder = PoseEncoder(session_id=9)
+    encoder = wire.PoseEncoder(session_id=9)
     reports = [encoder.encode(one)(7) for one in flight]
     yield {"session": "across the antimeridian and north", "reports": list(_read_poses(reports))}
-    encoder = PoseEncoder(session_id=9)
+    encoder = wire.PoseEncoder(session_id=9)
     places = [encoder.encode(one)(7) for one in place]
     yield {"session": "a place and no more", "reports": list(_read_poses(places))}
-    encoder = PoseEncoder(session_id=9, refresh_ns=2_500_000_000)
+    encoder = wire.PoseEncoder(session_id=9, refresh_ns=2_500_000_000)
     reports = [encoder.encode(one)(7) for one in flight]
     damaged = [
         replace(reports[1], coded=reports[1].coded[:-2]),
@@ -179,7 +170,7 @@ def poses() -> Iterator[dict[str, Any]]:
     ]
     yield {"session": "sixteen are lost", "reports": list(_read_poses(late))}
     for name, scripts in _pose_scripts().items():
-        made = [PoseReport(session=9, send_ns=7, coded=one.ended(stop="")) for one in scripts]
+        made = [wire.PoseReport(session=9, send_ns=7, coded=one.ended(stop="")) for one in scripts]
         yield {"session": name, "reports": list(_read_poses(made))}
 
 
@@ -230,18 +221,18 @@ def _pose_scripts() -> dict[str, list[BitWriter]]:
     }
 
 
-def _read_poses(reports: list[PoseReport]) -> Iterator[dict[str, Any]]:
-    decoder, session = PoseDecoder(), reports[0].session
+def _read_poses(reports: list[wire.PoseReport]) -> Iterator[dict[str, Any]]:
+    decoder, session = wire.PoseDecoder(), reports[0].session
     for report in reports:
         if report.session != session:
-            decoder, session = PoseDecoder(), report.session
+            decoder, session = wire.PoseDecoder(), report.session
         found: dict[str, Any] = {"hex": report.pack().hex()}
         if report.coding != 1:
             yield found | {"skipped": True}
             continue
         try:
             pose = decoder.decode(report)
-        except WireError:
+        except wire.WireError:
             yield found | {"damaged": True}
             continue
         yield found | ({"skipped": True} if pose is None else {"pose": _pose_numbers(pose)})

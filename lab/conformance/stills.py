@@ -4,8 +4,6 @@ Encoders differ from machine to machine, so that these are made once; a test has
 without a decoder of H.264 takes the decoded picture from the vector, and checks all around it.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import zlib
@@ -104,7 +102,6 @@ def still_cases() -> Iterator[dict[str, Any]]:
 
 
 def main() -> int:
-    """Write the file."""
     lines = ",\n".join(json.dumps(one) for one in vectors())
     FILE.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
     print(f"{FILE}: {lines.count(chr(10)) + 1} vectors")

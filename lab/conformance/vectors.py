@@ -3,8 +3,6 @@
 Nothing is drawn by chance: the same code gives the same files, and a test compares them.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct
@@ -17,20 +15,7 @@ from typing import Any
 
 import msgpack
 
-from hvt_common.protocol.messages import (
-    BacklogStill,
-    BacklogUnit,
-    BaseHeader,
-    Flags,
-    Message,
-    PackedMessage,
-    StillWire,
-    UnknownVersionError,
-    WireError,
-    kinds,
-    pack_backlog_still,
-    pack_backlog_units,
-)
+from hvt_common.protocol import messages as wire
 from hvt_common.protocol.messages.envelope import DEEPEST, MOST_UNKNOWN_FIELDS, WIRE_VERSION
 from hvt_ground.backlog.assembly import backlog_content
 from lab.conformance.dialogues import backlog_dialogues, base_orders, report_traces, still_sizes
@@ -40,7 +25,10 @@ from lab.conformance.stills import still_cases
 from rigs.messages import BASE, EXAMPLES, INFO, REQUEST, ROI, STEP
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "conformance"
-_PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", StillWire: b"a still"}
+_PAYLOADS: Mapping[type[wire.Message], bytes] = {
+    wire.BaseHeader: b"an access unit",
+    wire.StillWire: b"a still",
+}
 _EXAMPLES = [one.on_wire() for one in EXAMPLES]
 _WITH_NESTED = {"RoiHeader": ("also", 16), "ControlAnswer": ("tracks", 6), "Feedback": ("stills", 19)}
 """A field that holds nested arrays, and its place."""
@@ -53,7 +41,6 @@ class _Coded(bytes):
 
 
 def files() -> dict[str, str]:
-    """The text of each file, by name."""
     content = {
         "messages.json": list(_messages()),
         "refused.json": list(_refused()),
@@ -90,7 +77,6 @@ def schema_text() -> str:
 
 
 def main() -> int:
-    """Write all of them, and the schema."""
     FOLDER.mkdir(exist_ok=True)
     PATH.write_text(schema_text(), encoding="utf-8")
     for name, text in files().items():
@@ -243,7 +229,7 @@ def _messages() -> Iterator[dict[str, Any]]:
     yield from _good_envelopes()
 
 
-def _of_other_minors(message: Message) -> Iterator[dict[str, Any]]:
+def _of_other_minors(message: wire.Message) -> Iterator[dict[str, Any]]:
     """From a sender that knows more fields than we do, or fewer."""
     payload = _PAYLOADS.get(type(message), b"")
     values = _values(message)
@@ -271,7 +257,7 @@ def _with_nested(values: list[Any], place: int, *raw: Any) -> list[Any]:
     return [*values[:place], [[*one, *raw] for one in values[place]], *values[place + 1 :]]
 
 
-def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str, Any]:
+def _vector(message: wire.Message, what: str, data: bytes | None = None) -> dict[str, Any]:
     """``data`` is the message in another form, of the same fields."""
     payload = _PAYLOADS.get(type(message), b"")
     if data is not None:
@@ -285,9 +271,9 @@ def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str,
     }
 
 
-def replace_at(message: Message, place: int, raw: Any) -> Message:
+def replace_at(message: wire.Message, place: int, raw: Any) -> wire.Message:
     """The message with another value of a field, as MessagePack holds it."""
-    name, kind = kinds(type(message))[place - 1]
+    name, kind = wire.kinds(type(message))[place - 1]
     return replace(message, **{name: kind.decode(raw)})
 
 
@@ -308,8 +294,8 @@ def _plain(value: Any) -> Any:
 def _good_envelopes() -> Iterator[dict[str, Any]]:
     """The same fields in other bytes: whatever MessagePack allows is read."""
     values = msgpack.unpackb(BASE.pack())[:-1]
-    spare_bytes = BaseHeader.MAX_BYTES - len(BASE.pack()) - 2
-    payload = _PAYLOADS[BaseHeader]
+    spare_bytes = wire.BaseHeader.MAX_BYTES - len(BASE.pack()) - 2
+    payload = _PAYLOADS[wire.BaseHeader]
     wide = _Coded(b"\xcd" + WIRE_VERSION.to_bytes(2, "big"))
     yield _vector(BASE, "its version in 16 bits", _packed([wide, *values[1:]], payload))
     yield _vector(BASE, "as long as a message may be", _packed([*values, bytes(spare_bytes)], payload))
@@ -350,8 +336,8 @@ def _good_envelopes() -> Iterator[dict[str, Any]]:
 
 def _bad_envelopes() -> Iterator[dict[str, Any]]:
     values = msgpack.unpackb(BASE.pack())[:-1]
-    payload = _PAYLOADS[BaseHeader]
-    spare_bytes = BaseHeader.MAX_BYTES - len(BASE.pack()) - 2
+    payload = _PAYLOADS[wire.BaseHeader]
+    spare_bytes = wire.BaseHeader.MAX_BYTES - len(BASE.pack()) - 2
     for what, unknown in (
         ("a byte longer than a message may be", bytes(spare_bytes + 1)),
         ("an unknown field too deep", _nested(DEEPEST)),
@@ -374,8 +360,8 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
     ):
         yield _bad(REQUEST, what, _coded(REQUEST, {"arguments": coded}), b"")
     for name in ("w", "h", "b"):
-        sent = [kind.encode(getattr(ROI.on_wire(), one)) for one, kind in kinds(StillWire)]
-        sent[[one for one, _ in kinds(StillWire)].index("parameters")] = {name: 5}
+        sent = [kind.encode(getattr(ROI.on_wire(), one)) for one, kind in wire.kinds(wire.StillWire)]
+        sent[[one for one, _ in wire.kinds(wire.StillWire)].index("parameters")] = {name: 5}
         what = f"a parameter {name}, which has a field of its own"
         yield _bad(ROI.on_wire(), what, _packed([WIRE_VERSION, *sent], b"a still"), b"a still")
     whole = BASE.pack(payload)
@@ -396,7 +382,7 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
         yield vector | {"payload": {"zeros": most + 1}}
 
 
-def message_of(message: Message, zeros: int) -> bytes:
+def message_of(message: wire.Message, zeros: int) -> bytes:
     """Sealed over a payload of so many zeros, however many."""
     return _packed(msgpack.unpackb(message.pack())[:-1], bytes(zeros))
 
@@ -419,10 +405,10 @@ def _long_heads(levels: int) -> Iterator[tuple[str, _Coded]]:
         yield what, _Coded(head * (levels - 1) + b"\x90")
 
 
-def _coded(message: Message, changed: Mapping[str, bytes]) -> bytes:
+def _coded(message: wire.Message, changed: Mapping[str, bytes]) -> bytes:
     """With fields in other bytes."""
-    names = [name for name, _ in kinds(type(message))]
-    fields_of = PackedMessage.of(message).fields
+    names = [name for name, _ in wire.kinds(type(message))]
+    fields_of = wire.PackedMessage.of(message).fields
     rows = [changed.get(name, fields_of[name]) for name in names]
     body = msgpack.Packer().pack_array_header(len(rows) + 2) + bytes((WIRE_VERSION,)) + b"".join(rows)
     return (
@@ -473,23 +459,23 @@ def _refused() -> Iterator[dict[str, Any]]:
     yield from _bad_envelopes()
 
 
-def _values(message: Message) -> list[Any]:
+def _values(message: wire.Message) -> list[Any]:
     """Its version and all its fields as they are sent, those at the end too that are left out."""
-    return [WIRE_VERSION, *(kind.encode(getattr(message, name)) for name, kind in kinds(type(message)))]
+    return [WIRE_VERSION, *(kind.encode(getattr(message, name)) for name, kind in wire.kinds(type(message)))]
 
 
-def _edges(message: Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
+def _edges(message: wire.Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
     """Values at the bounds of each field, by its place: those that are read, or those refused."""
     payload = _PAYLOADS.get(type(message), b"")
     size = len(message.pack(payload))
     values = _values(message)
-    for place, (name, kind) in enumerate(kinds(type(message)), 1):
+    for place, (name, kind) in enumerate(wire.kinds(type(message)), 1):
         more = _PLACES if name == "place" else ()
         for raw, what in (*edges(kind.schema()), *_OF_ANY_TYPE, *more):
             changed = [*values[:place], raw, *values[place + 1 :]]
             try:
                 type(message).parse(_packed(changed, payload), payload)
-            except WireError:
+            except wire.WireError:
                 read = False
             else:
                 read = True
@@ -498,16 +484,16 @@ def _edges(message: Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
                 yield place, raw, f"{name} {what}"
 
 
-def _bad(message: Message, what: str, data: bytes, payload: bytes) -> dict[str, Any]:
+def _bad(message: wire.Message, what: str, data: bytes, payload: bytes) -> dict[str, Any]:
     try:
         type(message).parse(data, payload)
-    except WireError as error:
+    except wire.WireError as error:
         return {
             "message": name_of(type(message)),
             "what": what,
             "hex": data.hex(),
             "payload": payload.hex(),
-            "version": isinstance(error, UnknownVersionError),
+            "version": isinstance(error, wire.UnknownVersionError),
         }
     raise AssertionError(f"{type(message).__name__} is read although {what}")
 
@@ -523,13 +509,13 @@ def _packed(values: list[Any], payload: bytes) -> bytes:
 
 
 def _objects() -> Iterator[dict[str, Any]]:
-    header = replace(ROI, flags=int(Flags.STORED))
-    still = BacklogStill(header.pack(b"a still"), "image/jpeg", b"a still")
+    header = replace(ROI, flags=int(wire.Flags.STORED))
+    still = wire.BacklogStill(header.pack(b"a still"), "image/jpeg", b"a still")
     units = [
-        BacklogUnit(7, 1_000, keyframe=True, data=b"first"),
-        BacklogUnit(9, 1_200, keyframe=False, data=b"second"),
+        wire.BacklogUnit(7, 1_000, keyframe=True, data=b"first"),
+        wire.BacklogUnit(9, 1_200, keyframe=False, data=b"second"),
     ]
-    for kind, data in (("still", pack_backlog_still(still)), ("base", pack_backlog_units(units))):
+    for kind, data in (("still", wire.pack_backlog_still(still)), ("base", wire.pack_backlog_units(units))):
         yield _good_object(kind, "an example", data)
         for what, wrong in (
             ("its end is missing", data[:-1]),
@@ -538,17 +524,17 @@ def _objects() -> Iterator[dict[str, Any]]:
         ):
             yield _bad_object(kind, what, wrong)
     first = replace(still, attachment=replace(header, capture_ns=0).pack(b"a still"))
-    yield _good_object("still", "captured at the very first", pack_backlog_still(first))
+    yield _good_object("still", "captured at the very first", wire.pack_backlog_still(first))
     for count, what in ((1, "one frame"), (2400, "as many frames as may be")):
         rows = [[7 + frame, frame, False, b"x"] for frame in range(count)]
         yield _good_object("base", what, msgpack.packb(rows))
     rows = [[7, 1_000, True, b"first"], [9, 1_200, False, b"second"]]
     for what, wrong_header in (
-        ("it does not say that it was stored", replace(header, flags=255 - Flags.STORED)),
+        ("it does not say that it was stored", replace(header, flags=255 - wire.Flags.STORED)),
         ("it does not say when it was captured", replace(header, capture_ns=-1)),
     ):
         unsaid = replace(still, attachment=wrong_header.pack(b"a still"))
-        yield _bad_object("still", what, pack_backlog_still(unsaid))
+        yield _bad_object("still", what, wire.pack_backlog_still(unsaid))
     for what, changed in (
         ("no frame at all", []),
         ("frames are not in order", rows[::-1]),
@@ -588,7 +574,7 @@ def _object(kind: str, data: bytes) -> None:
 def _bad_object(kind: str, what: str, data: bytes) -> dict[str, Any]:
     try:
         _object(kind, data)
-    except WireError:
+    except wire.WireError:
         return {"kind": kind, "what": what, "hex": data.hex()}
     raise AssertionError(f"the object {kind} is read although {what}")
 

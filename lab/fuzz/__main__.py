@@ -6,8 +6,6 @@ begins again with the rest, with its finding set aside. At the end there is one 
 build/fuzz/summary.json.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """The contract of a fuzzing target."""
 
-from __future__ import annotations
-
 import atexit
 import shutil
 from collections.abc import Callable, Sequence

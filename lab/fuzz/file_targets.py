@@ -1,7 +1,5 @@
 """Files from elsewhere: poses beside a clip, and the log of another ground."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Callable

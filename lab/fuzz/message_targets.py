@@ -1,7 +1,5 @@
 """Every message of the wire, with its checksum kept right."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,32 +7,8 @@ from random import Random
 
 import numpy as np
 
+from hvt_common.protocol import messages as wire
 from hvt_common.protocol.channels import parse_key
-from hvt_common.protocol.messages import (
-    BacklogHeader,
-    BacklogStill,
-    BacklogUnit,
-    BaseHeader,
-    ControlAnswer,
-    ControlRequest,
-    Feedback,
-    Flags,
-    Info,
-    Message,
-    PoseDecoder,
-    PoseEncoder,
-    PoseReport,
-    RoiHeader,
-    Status,
-    TrackStep,
-    TrackStepDecoder,
-    TrackStepEncoder,
-    WireError,
-    pack_backlog_still,
-    pack_backlog_units,
-    parse_backlog_still,
-    parse_backlog_units,
-)
 from hvt_common.values import Orientation, Pose
 from lab.fuzz.contract import Target
 from lab.fuzz.mutate import Bytes, changed_values, each_part, joined, parted, plain, with_checksum
@@ -43,9 +17,9 @@ from rigs.flight import tracks_at
 
 _NOW = 1_790_000_000_000_000_000
 
-ROI = replace(messages.ROI, flags=int(Flags.STORED), parameters={})
+ROI = replace(messages.ROI, flags=int(wire.Flags.STORED), parameters={})
 REQUESTS = tuple(
-    ControlRequest(session_id=0, command=command, arguments=arguments)
+    wire.ControlRequest(session_id=0, command=command, arguments=arguments)
     for command, arguments in (
         ("keyframe", {}),
         ("still", {"track": 5, "at_ms": -500, "quality": 80}),
@@ -59,23 +33,23 @@ REQUESTS = tuple(
 )
 
 
-def feedback(**changes: object) -> Feedback:
+def feedback(**changes: object) -> wire.Feedback:
     """A receiver report with something in every field."""
     return replace(messages.FEEDBACK, **changes)  # type: ignore[arg-type]
 
 
-_UNITS = tuple(BacklogUnit(n, _NOW + n * 66_666_667, n == 0, bytes([n]) * (20 + n)) for n in range(6))
+_UNITS = tuple(wire.BacklogUnit(n, _NOW + n * 66_666_667, n == 0, bytes([n]) * (20 + n)) for n in range(6))
 
 
-def _parsed(message: type[Message]) -> Callable[[bytes], None]:
+def _parsed(message: type[wire.Message]) -> Callable[[bytes], None]:
     """Parse it; a parsed message can be sent again and means the same."""
 
     def run(data: bytes) -> None:
         try:
             value = message.parse(data)
-        except WireError:
+        except wire.WireError:
             return
-        if isinstance(value, Info):
+        if isinstance(value, wire.Info):
             value.view.to_base(np.zeros((1, 4), np.float32))
         if len(data) <= message.MAX_BYTES - 64:  # short floats come back long
             assert message.parse(value.pack()) == value
@@ -83,12 +57,12 @@ def _parsed(message: type[Message]) -> Callable[[bytes], None]:
     return run
 
 
-def _with_payload(message: type[Message]) -> Callable[[bytes], None]:
+def _with_payload(message: type[wire.Message]) -> Callable[[bytes], None]:
     """Attachment and payload: bytes that are not those of the checksum never parse."""
 
     def run(data: bytes) -> None:
         attachment, payload = parted(data, least=2)[:2]
-        with contextlib.suppress(WireError):
+        with contextlib.suppress(wire.WireError):
             value = message.parse(attachment, payload)
             assert message.parse(value.pack(payload), payload) == value
 
@@ -107,10 +81,10 @@ def _with_changed_payload(data: bytes, rng: Random, raw: Bytes) -> bytes:
 
 
 def _track_steps(data: bytes) -> None:
-    decoder = TrackStepDecoder()
+    decoder = wire.TrackStepDecoder()
     for part in parted(data):
-        with contextlib.suppress(WireError):
-            step = TrackStep.parse(part)
+        with contextlib.suppress(wire.WireError):
+            step = wire.TrackStep.parse(part)
             tracks = decoder.decode(step)
             if tracks is not None:
                 assert np.isfinite(tracks.boxes_xyxy_px).all()
@@ -122,7 +96,7 @@ def _track_steps(data: bytes) -> None:
 def _step_seeds() -> list[bytes]:
     seeds = []
     for count, refresh_ns in ((3, 0), (6, 1_000_000_000), (40, 1_000_000_000)):
-        encoder = TrackStepEncoder(session_id=5, refresh_ns=refresh_ns)
+        encoder = wire.TrackStepEncoder(session_id=5, refresh_ns=refresh_ns)
         steps = [
             encoder.encode(
                 tracks_at(
@@ -138,15 +112,15 @@ def _step_seeds() -> list[bytes]:
 
 
 def _pose_reports(data: bytes) -> None:
-    decoder = PoseDecoder()
+    decoder = wire.PoseDecoder()
     for part in parted(data):
-        with contextlib.suppress(WireError):
-            pose = decoder.decode(PoseReport.parse(part))
+        with contextlib.suppress(wire.WireError):
+            pose = decoder.decode(wire.PoseReport.parse(part))
             assert pose is None or (abs(pose.latitude_deg) <= 90 and abs(pose.longitude_deg) <= 180)
 
 
 def _pose_seeds() -> list[bytes]:
-    encoder = PoseEncoder(session_id=5)
+    encoder = wire.PoseEncoder(session_id=5)
     reports = [
         encoder.encode(
             Pose(
@@ -164,17 +138,17 @@ def _pose_seeds() -> list[bytes]:
 
 
 def _backlog_still(data: bytes) -> None:
-    with contextlib.suppress(WireError):
-        still = parse_backlog_still(data)
-        assert parse_backlog_still(pack_backlog_still(still)) == still
-        with contextlib.suppress(WireError):
-            RoiHeader.parse(still.attachment, still.payload)
+    with contextlib.suppress(wire.WireError):
+        still = wire.parse_backlog_still(data)
+        assert wire.parse_backlog_still(wire.pack_backlog_still(still)) == still
+        with contextlib.suppress(wire.WireError):
+            wire.RoiHeader.parse(still.attachment, still.payload)
 
 
 def _backlog_units(data: bytes) -> None:
-    with contextlib.suppress(WireError):
-        units = parse_backlog_units(data)
-        assert parse_backlog_units(pack_backlog_units(units)) == units
+    with contextlib.suppress(wire.WireError):
+        units = wire.parse_backlog_units(data)
+        assert wire.parse_backlog_units(wire.pack_backlog_units(units)) == units
 
 
 def _key(data: bytes) -> None:
@@ -183,7 +157,9 @@ def _key(data: bytes) -> None:
     assert found is None or f"hvt/{found[0]}/{found[1]}" == text
 
 
-def _message(name: str, message: type[Message], seeds: Sequence[Message], *, share: int = 40) -> Target:
+def _message(
+    name: str, message: type[wire.Message], seeds: Sequence[wire.Message], *, share: int = 40
+) -> Target:
     return Target(
         name,
         _parsed(message),
@@ -194,7 +170,7 @@ def _message(name: str, message: type[Message], seeds: Sequence[Message], *, sha
     )
 
 
-def _streamed(name: str, message: type[Message], seed: Message) -> Target:
+def _streamed(name: str, message: type[wire.Message], seed: wire.Message) -> Target:
     payload = b"\0\0\0\1 payload"
     return Target(
         name,
@@ -208,18 +184,18 @@ def _streamed(name: str, message: type[Message], seed: Message) -> Target:
 
 def _backlog_still_seeds() -> list[bytes]:
     payload = plain(Random(1))(b"\xff\xd8\xff" + bytes(40))
-    return [pack_backlog_still(BacklogStill(ROI.pack(payload), "image/jpeg", payload))]
+    return [wire.pack_backlog_still(wire.BacklogStill(ROI.pack(payload), "image/jpeg", payload))]
 
 
 TARGETS = (
-    _streamed("base-header", BaseHeader, messages.BASE),
-    _streamed("roi-header", RoiHeader, ROI),
-    _streamed("backlog-header", BacklogHeader, messages.BACKLOG),
-    _message("status", Status, [messages.STATUS]),
-    _message("info", Info, [messages.INFO]),
-    _message("control-request", ControlRequest, REQUESTS),
-    _message("control-answer", ControlAnswer, [messages.ANSWER]),
-    _message("feedback", Feedback, [feedback(), feedback(stills=(), backlog=(), missing_stills=())]),
+    _streamed("base-header", wire.BaseHeader, messages.BASE),
+    _streamed("roi-header", wire.RoiHeader, ROI),
+    _streamed("backlog-header", wire.BacklogHeader, messages.BACKLOG),
+    _message("status", wire.Status, [messages.STATUS]),
+    _message("info", wire.Info, [messages.INFO]),
+    _message("control-request", wire.ControlRequest, REQUESTS),
+    _message("control-answer", wire.ControlAnswer, [messages.ANSWER]),
+    _message("feedback", wire.Feedback, [feedback(), feedback(stills=(), backlog=(), missing_stills=())]),
     Target(
         "track-steps",
         _track_steps,
@@ -234,7 +210,7 @@ TARGETS = (
     Target(
         "backlog-units",
         _backlog_units,
-        lambda: [pack_backlog_units(_UNITS), pack_backlog_units(_UNITS[:1])],
+        lambda: [wire.pack_backlog_units(_UNITS), wire.pack_backlog_units(_UNITS[:1])],
         share=40,
     ),
     Target("key", _key, lambda: [b"hvt/uav-1/base", b"hvt/a/alive", b"hvt//roi"], share=30, most_bytes=256),

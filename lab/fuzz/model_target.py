@@ -1,7 +1,5 @@
 """Model files: the walk before the runtime, and the runtime."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np

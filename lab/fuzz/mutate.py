@@ -3,8 +3,6 @@
 `Bytes` is whatever mutates plain bytes: libFuzzer's own mutator where atheris drives, `plain` in the short tests.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from random import Random

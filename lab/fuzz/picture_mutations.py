@@ -1,7 +1,5 @@
 """Mutations of a still that leave its outside whole: a header that is refused keeps the decoder behind it untried."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from random import Random
 

@@ -1,7 +1,5 @@
 """Every decoder of pictures that the network reaches: stills of each codec, stills with their headers, the base."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from dataclasses import replace

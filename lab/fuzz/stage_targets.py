@@ -1,7 +1,5 @@
 """Messages that parse, against the stages behind the parser: reassembly, commands, reports."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """All targets by name."""
 
-from __future__ import annotations
-
 from hvt_common.protocol.channels import parse_key
 from lab.fuzz import (
     file_targets,

@@ -1,7 +1,5 @@
 """Text of a user, a file or a model's metadata: command lines, TOML, Zenoh configurations, rosters, manifests."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Callable

@@ -6,8 +6,6 @@ Leaves ``TARGET.json`` in the folder: inputs so far, memory over time, the slowe
 The input that broke it lies in ``found/``.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json
@@ -91,7 +89,6 @@ class Watched:
             raise MemoryError(f"one input took {risen_mb} MB")
 
     def write(self) -> None:
-        """Write the file anew."""
         progress = self._progress
         self._written_s = time.monotonic()
         progress.seconds = time.process_time() - self._began_s

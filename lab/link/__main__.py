@@ -3,8 +3,6 @@
 Each run leaves its processes' output, the recording and the table of arrivals under build/link/SCENARIO.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shlex

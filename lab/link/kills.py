@@ -6,8 +6,6 @@ which must end well. The files of both sides are compared with ``hvt-ground --ti
 of the last frame in it.
 """
 
-from __future__ import annotations
-
 import argparse
 import concurrent.futures
 import random
@@ -218,7 +216,6 @@ def in_matroska(path: Path) -> list[float] | None:
 
 
 def rows_of(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """The table's rows."""
     real = [one for one in verdicts if not one.ended]
     recording = [one.recording_missing_s for one in verdicts if one.recording_missing_s is not None]
     matroska = [one.matroska_missing_s for one in verdicts if one.matroska_missing_s is not None]

@@ -1,7 +1,5 @@
 """Runs hvt-edge and hvt-ground as real processes over a bad link, and gathers the results."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
@@ -52,7 +50,6 @@ class Run:
 
     @property
     def script(self) -> Script:
-        """The course of the link."""
         script = self.scenario.script(self.length, seed=self.seed, lasts=self.lasts)
         return script.without_delay() if self.carrier == "netns" else script
 

@@ -1,7 +1,5 @@
 """The source of the edge: a clip as long as the scenario, made by repeating a shorter one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

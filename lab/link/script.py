@@ -3,8 +3,6 @@
 A script is a pure function of the file, the length and the seed: relay and namespaces play the same one.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import random
@@ -51,7 +49,6 @@ class Scenario:
 
 
 def scenario_names() -> list[str]:
-    """All there are."""
     return sorted(file.stem for file in SCENARIOS.glob("*.toml"))
 
 

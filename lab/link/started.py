@@ -1,7 +1,5 @@
 """One process of the laboratory: any command, so that it can run inside a namespace, and its output."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 from pathlib import Path

@@ -55,7 +55,6 @@ class Script:
         object.__setattr__(self, "dark", tuple(_dark_spans(self.phases)))
 
     def at(self, t_s: float) -> LinkState:
-        """The state at a moment."""
         return self.phases[self._index(t_s)].state
 
     def until(self, t_s: float) -> float:
@@ -81,7 +80,6 @@ class Script:
             t_s = end_s
 
     def carries_bits(self, start_s: float, end_s: float) -> float:
-        """How many bits fit into this span."""
         total, t_s = 0.0, start_s
         while t_s < end_s:
             state, step_s = self.at(t_s), min(end_s, self.until(t_s))

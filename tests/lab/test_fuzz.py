@@ -4,8 +4,6 @@
 no coverage, the same inputs every time.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """``kill -9`` in the air, which `make kills` flies: its seeds, and that its judgement can be a bad one."""
 
-from __future__ import annotations
-
 import contextlib
 import sqlite3
 
@@ -30,7 +28,6 @@ def test_the_kills_come_from_the_seed_and_hit_both_sides():
 
 
 def arrival(index: int) -> Arrival:
-    """A frame of ten a second."""
     at_s = 1_790_000_000 + index / 10
     return Arrival("base", index, index, at_s, at_s + 0.01, at_s + 0.05, True, 1000)
 
@@ -49,10 +46,9 @@ def test_what_cannot_be_read_is_noticed(tmp_path, capsys):
     """The bar would hold whatever the files are."""
     for name in ("run.rrd", "base.mkv"):
         (tmp_path / name).write_bytes(b"\x1aE\xdf\xa3" + bytes(5000))
-    assert in_recording(tmp_path / "run.rrd") is None
-    assert in_recording(tmp_path / "absent.rrd") is None
-    assert in_matroska(tmp_path / "base.mkv") is None
-    assert in_matroska(tmp_path / "absent.mkv") is None
+    for read, ending in ((in_recording, "rrd"), (in_matroska, "mkv")):
+        assert read(tmp_path / f"{'run' if ending == 'rrd' else 'base'}.{ending}") is None
+        assert read(tmp_path / f"absent.{ending}") is None
     assert "absent.mkv" in capsys.readouterr().err
 
 
@@ -65,6 +61,9 @@ def test_a_store_is_read_as_the_next_start_would(tmp_path):
     with Store(tmp_path / "store", max_bytes=10**8, session_id=7, info=lambda: info) as store:
         for unit in units:
             store.add_unit(unit)
+    assert store_left(tmp_path / "none") == StoreLeft(0, 0, 0.0), (
+        "a flight without an outage counts against nobody"
+    )
     whole = store_left(tmp_path / "store")
     assert (whole.objects, whole.unreadable, whole.missing_s) == (1, 0, 0)
 
@@ -76,11 +75,6 @@ def test_a_store_is_read_as_the_next_start_would(tmp_path):
     cut = damage(20)
     assert (cut.unreadable, cut.missing_s) == (0, pytest.approx(1.0))
     assert damage(0).unreadable == 1
-
-
-def test_a_store_that_was_never_needed_is_whole(tmp_path):
-    """Each flight without an outage would count against it."""
-    assert store_left(tmp_path / "none") == StoreLeft(0, 0, 0.0)
 
 
 def test_a_bad_end_holds_no_bar():

@@ -1,7 +1,5 @@
 """The numbers of `make link`, on arrivals whose numbers are known."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -22,14 +20,11 @@ STORE = dict.fromkeys(
 
 
 def frame(index: int, *, delay_s: float = 0.1, shown: bool = True, size: int = 5000) -> Arrival:
-    """A base frame of 10 a second."""
     capture_s = BEGAN_S + index / 10
     return Arrival("base", index, index, capture_s, capture_s + 0.02, capture_s + delay_s, shown, size)
 
 
-def outcome(
-    name: str, frames: list[Arrival], *, sent: int | None = None, store: dict[str, int] | None = None
-) -> Outcome:
+def outcome(name: str, frames: list[Arrival], *, sent: int | None = None, store=None) -> Outcome:
     """What a run with these arrivals would be."""
     sums = {"base_bytes": 1000, "roi_bytes": 10, "backlog_bytes": 7, "meta_bytes": 0, "overhead_bytes": 5}
     edge = {
@@ -39,14 +34,9 @@ def outcome(
         "stills": {"sent": 8, "reasons": {"sent": {"utility": 7, "stored": 1}}},
         "store": None if store is None else STORE | store,
     }
-    ground = {
-        **sums,
-        "roi_bytes": 8,
-        "stills": {"received": 4},
-        "backlog": {"stills": 2, "frames": 50, "video_s": 5.0},
-        "keyframe_requests": 2,
-        "lost": 1,
-    }
+    back = {"stills": 2, "frames": 50, "video_s": 5.0}
+    ground = {**sums, "roi_bytes": 8, "stills": {"received": 4}, "backlog": back}
+    ground |= {"keyframe_requests": 2, "lost": 1}
     return Outcome(
         scenario=name,
         script=load_scenario(name).script("full"),
@@ -60,54 +50,60 @@ def outcome(
     )
 
 
-def test_delays_and_their_floor():
-    """The table's first number would be another."""
-    found = measures(outcome("steady-1M", [frame(i) for i in range(600)]))
-    assert found["frame delay p50, ms"] == pytest.approx(100)
-    # 20 ms of encoding, 40 ms on the line at 1 Mbps, 20 ms of delay and 2 ms of jitter.
-    assert found["frame delay p95 over floor"] == pytest.approx(100 / 82)
-    assert found["delivered, kbps"] == pytest.approx(400, rel=0.01)
+LATE = dict.fromkeys(range(152, 180), 1.5) | {160: 0.3}
+AFTER_DARKNESS = [
+    *(frame(i) for i in range(119)),
+    *(frame(i, delay_s=20.5 - i / 10) for i in range(120, 190)),
+    *(frame(i) for i in range(230, 400)),
+]
+RATE_BACK = "90 % of the rate again after a rise, s"
 
 
-def test_what_could_not_be_decoded_and_what_never_came_counts_against():
-    """A stream of garbage would be a whole picture."""
-    frames = [frame(i, shown=not 100 <= i < 130) for i in range(600) if not 300 <= i < 350]
-    found = measures(outcome("steady-1M", frames, sent=600))
-    assert found["decodable frames, %"] == pytest.approx(100 * 520 / 600)
-    assert found["longest without a picture, s"] == pytest.approx(5.1)
+@pytest.mark.parametrize(
+    ("name", "frames", "measured"),
+    [
+        # 20 ms of encoding, 40 ms on the line at 1 Mbps, 20 ms of delay and 2 ms of jitter.
+        (
+            "steady-1M",
+            [frame(i) for i in range(600)],
+            {"frame delay p50, ms": 100, "frame delay p95 over floor": 100 / 82},
+        ),
+        ("steady-1M", [frame(i) for i in range(600)], {"delivered, kbps": pytest.approx(400, rel=0.01)}),
+        # A stream of garbage would be a whole picture; a run that died in the middle would have the best gaps.
+        (
+            "steady-1M",
+            [frame(i, shown=not 100 <= i < 130) for i in range(600) if not 300 <= i < 350],
+            {"decodable frames, %": 100 * 520 / 600, "longest without a picture, s": 5.1},
+        ),
+        ("steady-1M", [frame(i) for i in range(300)], {"longest without a picture, s": 30.0}),
+        # One early frame would count as a recovery; an adaptation that stays down would pass.
+        (
+            "step-1M-200k-1M",
+            sorted((frame(i, delay_s=LATE.get(i, 0.1)) for i in range(600)), key=lambda one: one.received_s),
+            {"under 1 s again after a fall, s": pytest.approx(179 / 10 + 1.5 - 15, abs=0.11)},
+        ),
+        (
+            "step-1M-200k-1M",
+            [frame(i, size=5000 if i < 150 else 1000) for i in range(600)],
+            {RATE_BACK: math.inf},
+        ),
+        (
+            "step-1M-200k-1M",
+            [frame(i, size=1000 if 150 <= i < 400 else 5000) for i in range(600)],
+            {RATE_BACK: pytest.approx(7, abs=0.5)},
+        ),
+        # The flood of old frames after an outage would be taken for the present.
+        ("outage-8s", AFTER_DARKNESS, {"live again after darkness, s": 3.1}),
+    ],
+)
+def test_what_is_measured_of_arrivals(name, frames, measured):
+    """The table's numbers would be others."""
+    found = measures(outcome(name, frames, sent=600))
+    assert {measure: found[measure] for measure in measured} == pytest.approx(measured)
 
 
-def test_a_picture_that_ends_early_is_missing_until_the_end():
-    """A run that died in the middle would have the best gaps."""
-    found = measures(outcome("steady-1M", [frame(i) for i in range(300)]))
-    assert found["longest without a picture, s"] == pytest.approx(30.0)
-
-
-def test_calm_after_a_fall_is_when_the_last_late_frame_has_come():
-    """One early frame would count as a recovery."""
-    delays = dict.fromkeys(range(152, 180), 1.5) | {160: 0.3}
-    frames = sorted(
-        (frame(i, delay_s=delays.get(i, 0.1)) for i in range(600)), key=lambda one: one.received_s
-    )
-    found = measures(outcome("step-1M-200k-1M", frames))
-    assert found["under 1 s again after a fall, s"] == pytest.approx(179 / 10 + 1.5 - 15, abs=0.11)
-
-
-def test_a_rate_that_never_comes_back_holds_no_bar():
-    """An adaptation that stays down would pass."""
-    low = [frame(i, size=5000 if i < 150 else 1000) for i in range(600)]
-    back = [frame(i, size=1000 if 150 <= i < 400 else 5000) for i in range(600)]
-    name = "90 % of the rate again after a rise, s"
-    assert measures(outcome("step-1M-200k-1M", low))[name] == math.inf
-    assert measures(outcome("step-1M-200k-1M", back))[name] == pytest.approx(7, abs=0.5)
-
-
-def test_live_again_asks_for_a_fresh_picture():
-    """The flood of old frames after an outage would be taken for the present."""
-    before = [frame(i) for i in range(119)]
-    old = [frame(i, delay_s=20.5 - i / 10) for i in range(120, 190)]
-    found = measures(outcome("outage-8s", [*before, *old, *(frame(i) for i in range(230, 400))]))
-    assert found["live again after darkness, s"] == pytest.approx(3.1)
+HOLDS = {"stills lost": False, "unheard of": False, "edge, exit code": True, "ground, exit code": False}
+HOLDS |= {"edge, tracebacks": True, "ground, tracebacks": False}
 
 
 def test_accounts_and_processes():
@@ -115,17 +111,13 @@ def test_accounts_and_processes():
     result = outcome("outage-60s", [*(frame(i) for i in range(1200)), *(still(i) for i in range(6))])
     found = {row["measure"]: row for row in rows(result, {"stills lost": "== 0", "unheard of": "<= 1"})}
     assert found["ledger difference, bytes"]["value"] == 2
-    assert (found["stills lost"]["value"], found["stills lost"]["holds"]) == (1, False)
-    assert found["unheard of"]["holds"] is False
-    assert found["edge, exit code"]["holds"] is True
-    assert found["ground, exit code"]["holds"] is False
-    assert (found["edge, tracebacks"]["holds"], found["ground, tracebacks"]["holds"]) == (True, False)
+    assert found["stills lost"]["value"] == 1
+    assert {name: found[name]["holds"] for name in HOLDS} == HOLDS
     assert found["edge, memory slope MB/h"]["value"] == pytest.approx(1.0, abs=0.01)
     json.dumps(list(found.values()), allow_nan=False)
 
 
 def still(sequence: int, kind: str = "roi", *, shown: bool = True) -> Arrival:
-    """A still that came, on either way."""
     return Arrival(kind, sequence, 0, BEGAN_S, BEGAN_S, BEGAN_S + 1, shown, 500)
 
 
@@ -133,11 +125,8 @@ def test_what_is_still_kept_is_not_lost_and_what_was_given_up_is():
     """An edge that throws away what it kept would lose nothing."""
     first = STORED_FROM
     came = [still(number) for number in (0, 1, 2, 4, 5)]
-    past = [
-        still(first, "backlog-still"),
-        still(first + 1, "backlog-still", shown=False),
-        still(3, "backlog-base"),
-    ]
+    past = [still(first, "backlog-still"), still(first + 1, "backlog-still", shown=False)]
+    past.append(still(3, "backlog-base"))
 
     def lost(stored: set[int], **store: int) -> float:
         result = outcome("outage-60s", [*came, *past], store=store)
@@ -154,20 +143,20 @@ def test_what_the_store_did_is_told_where_it_did_something():
     """The numbers of `outage-60s` would be nowhere, or in every scenario's table."""
     frames = [frame(i) for i in range(600)]
     found = measures(outcome("outage-60s", frames, store={"stills": 9, "video_s": 12}))
-    assert found["stills that came afterwards"] == 2
-    assert found["stills still kept at the end"] == 9
-    assert found["video still kept at the end, s"] == 12
-    assert "stills that came afterwards" not in measures(outcome("outage-60s", frames, store={}))
-    assert "stills that came afterwards" not in measures(outcome("outage-60s", frames))
+    told = "stills that came afterwards"
+    kept = found["stills still kept at the end"], found["video still kept at the end, s"]
+    assert (found[told], *kept) == (2, 9, 12)
+    assert told not in measures(outcome("outage-60s", frames, store={}))
+    assert told not in measures(outcome("outage-60s", frames))
 
 
-def test_bars_are_read_as_they_are_written():
+@pytest.mark.parametrize(
+    ("value", "bar", "held"),
+    [(2.0, "<= 2", 1), (2.1, "<= 2", 0), (97, ">= 97", 1), (None, "== 0", 0), (math.inf, ">= 97", 0)],
+)
+def test_bars_are_read_as_they_are_written(value, bar, held):
     """`<= 2` would be `< 2`, or infinity good enough."""
-    assert holds(2.0, "<= 2")
-    assert not holds(2.1, "<= 2")
-    assert holds(97, ">= 97")
-    assert not holds(None, "== 0")
-    assert not holds(math.inf, ">= 97")
+    assert holds(value, bar) == bool(held)
 
 
 def test_the_rate_over_time_leaves_nothing_out():
@@ -176,15 +165,11 @@ def test_the_rate_over_time_leaves_nothing_out():
     assert sum(rate_over_time(result)) == 590 * 8000
 
 
-def test_a_flat_memory_has_no_slope():
-    """The start would count as a leak, or the moment in which a recording is folded."""
+def test_memory_has_the_slope_of_its_leak_and_of_nothing_else():
+    """The start would count as a leak, or the moment in which a recording is folded; or a leak would hide there."""
     samples = [Sample(i, 50 + min(i, 30) + 40 * (i == 70), 5, 5) for i in range(100)]
     assert slope_mb_per_hour(samples) == pytest.approx(0, abs=1e-6)
     assert slope_mb_per_hour(samples[:5]) is None
-
-
-def test_a_leak_has_a_slope_whatever_else_there_is():
-    """A megabyte an hour would hide behind what comes and goes."""
     samples = [Sample(i / 4, 500 + i / 4 / 3600 + 9 * (i % 60 < 3), 5, 5) for i in range(14_400)]
     assert slope_mb_per_hour(samples) == pytest.approx(1, abs=0.05)
 
@@ -192,11 +177,9 @@ def test_a_leak_has_a_slope_whatever_else_there_is():
 def test_more_at_the_end_is_what_stays():
     """A leak of descriptors would not show, or an open file for a moment would."""
 
-    def samples(levels: list[int]) -> list[Sample]:
-        return [Sample(float(i), 50.0, level, 5) for i, level in enumerate(levels)]
-
     def more(levels: list[int]) -> float | None:
-        return more_at_the_end(samples(levels), lambda sample: sample.descriptors)
+        samples = [Sample(float(i), 50.0, level, 5) for i, level in enumerate(levels)]
+        return more_at_the_end(samples, lambda sample: sample.descriptors)
 
     assert more([20] * 100) == 0
     assert more([20] * 85 + [27] + [20] * 14) == 0

@@ -1,14 +1,13 @@
 """The same script on the kernel's own TCP, between two network namespaces."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from itertools import accumulate
 
 import pytest
 
-from lab.link.carriers.netns import GROUND_HOST, Namespaces, UnavailableError
+from lab.link.carriers.netns import Namespaces
+from lab.link.carriers.sides import GROUND_HOST, UnavailableError
 from lab.link.timeline import LinkState, Phase, Script
 from programs.processes import eventually
 
@@ -82,13 +81,11 @@ def wire_field():
 
 
 def script(*pieces: tuple[float, LinkState], lasts_s: float) -> Script:
-    """A script by hand."""
     return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=16_000)
 
 
 def namespaces() -> str:
-    """All that there are on the machine."""
-    return subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+    return subprocess.check_output(["ip", "netns", "list"], text=True)
 
 
 def test_the_shaper_follows_the_script(wire_field):
@@ -157,8 +154,5 @@ def test_nothing_is_left_behind():
 def test_what_is_missing_is_named(monkeypatch):
     """`make link CARRIER=netns` on a laptop would end in a traceback."""
     monkeypatch.setenv("PATH", "/nonexistent")
-    with (
-        pytest.raises(UnavailableError, match="needs the command ip"),
-        Namespaces(script((0, LinkState(1)), lasts_s=1)),
-    ):
-        pass
+    with pytest.raises(UnavailableError, match="needs the command ip"):
+        Namespaces(script((0, LinkState(1)), lasts_s=1)).__enter__()

@@ -1,7 +1,5 @@
 """The lab's own honesty: a relay that is kinder or harsher than its script would praise or blame HVT for nothing."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import random
@@ -22,7 +20,6 @@ PACKET = 1200 + DATAGRAM_HEADER_BYTES
 
 
 def script(*pieces: tuple[float, LinkState], lasts_s: float = 60.0, queue_bytes: int = 32_000) -> Script:
-    """A script by hand."""
     return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=queue_bytes)
 
 
@@ -233,34 +230,36 @@ def test_what_darkness_takes_wakes_with_its_connection():
     ]
 
 
-# Real sockets
-
-
-def exchange(relay: Relay, listener: socket.socket, *, seconds: float) -> list[tuple[float, int]]:
-    """Send through the relay as fast as it takes; return when how many bytes came."""
-    got: list[tuple[float, int]] = []
+@contextlib.contextmanager
+def receiving(listener: socket.socket):
+    """What comes to the listener from the first that connects, and when; all of it at the end."""
+    got: list[tuple[float, bytes]] = []
 
     def receive() -> None:
         with listener.accept()[0] as far:
             while data := far.recv(65536):
-                got.append((time.monotonic(), len(data)))
+                got.append((time.monotonic(), data))
 
     thread = threading.Thread(target=receive)
     thread.start()
-    with socket.socket() as near:
+    yield got
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+def exchange(relay: Relay, listener: socket.socket, *, seconds: float) -> list[tuple[float, bytes]]:
+    """Send through the relay as fast as it takes; return what came when."""
+    with receiving(listener) as got, socket.socket() as near:
         near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8192)
         near.connect(("127.0.0.1", relay.port))
         ends_s = time.monotonic() + seconds
         while time.monotonic() < ends_s:
             near.sendall(bytes(1000))
-    thread.join(60)
-    assert not thread.is_alive()
     return got
 
 
 @pytest.fixture
 def listener():
-    """A program that listens."""
     with socket.create_server(("127.0.0.1", 0)) as one:
         yield one
 
@@ -276,7 +275,7 @@ def test_a_tcp_sender_gets_the_rate_and_never_more(listener):
         lasted_s = time.monotonic() - began_s
         assert 8 * relay.up.passed_bytes <= rate_bps * lasted_s + 8 * queue_bytes
     full = 1 + SEGMENT_HEADER_BYTES / 1448  # at the least: not all segments are
-    line_bits = [8 * full * size for size in accumulate(size for _, size in got)]
+    line_bits = [8 * full * size for size in accumulate(len(data) for _, data in got)]
     assert line_bits[-1] > 8 * queue_bytes
     for (at_s, _), bits in zip(got, line_bits, strict=True):
         assert bits <= rate_bps * (at_s - began_s - delay_s)
@@ -287,23 +286,12 @@ def test_all_comes_whole_and_in_order_through_bursts_of_loss(listener):
     light, lost = (LinkState(4_000_000, delay_s=0.01, jitter_s=0.01, loss=share) for share in (0.0, 1.0))
     bursts = [piece for i in range(1, 50) for piece in ((0.2 * i, lost), (0.2 * i + 0.01, light))]
     sent = random.Random(1).randbytes(1_000_000)
-    got = bytearray()
-
-    def receive() -> None:
-        with listener.accept()[0] as far:
-            while data := far.recv(65536):
-                got.extend(data)
-
-    thread = threading.Thread(target=receive)
-    thread.start()
     with Relay(script((0, light), *bursts), target_port=listener.getsockname()[1]) as relay:
         relay.begin()
-        with socket.create_connection(("127.0.0.1", relay.port)) as near:
+        with receiving(listener) as got, socket.create_connection(("127.0.0.1", relay.port)) as near:
             near.sendall(sent)
-        thread.join(60)
-        assert not thread.is_alive()
         assert relay.up.lost > 10
-    assert bytes(got) == sent
+    assert b"".join(data for _, data in got) == sent
 
 
 def test_what_is_mended_early_is_handed_on_early():

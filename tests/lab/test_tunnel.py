@@ -1,7 +1,5 @@
 """The whole script on the kernel's own TCP, between two network namespaces and through a program."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json
@@ -17,7 +15,8 @@ import psutil
 import pytest
 
 from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, Pipe
-from lab.link.carriers.tunnel import GROUND_HOST, Flight, Tunnel, UnavailableError
+from lab.link.carriers.sides import GROUND_HOST, UnavailableError
+from lab.link.carriers.tunnel import Flight, Tunnel
 from lab.link.laboratory import Run, run
 from lab.link.measures.outcome import measures
 from lab.link.script import load_scenario
@@ -97,7 +96,6 @@ UTTERED_BYTES = 100 + DATAGRAM_HEADER_BYTES
 
 
 def script(*pieces: tuple[float, LinkState], lasts_s: float = 60.0) -> Script:
-    """A script by hand."""
     return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=64_000)
 
 
@@ -138,44 +136,24 @@ def over(wanted: Script, *, ground: str, edge: str, arguments: tuple[str, ...] =
     return json.loads(said), json.loads(near.stdout or "null"), link
 
 
-class Datagrams:
-    """Numbered datagrams from the edge, and which of them have come."""
-
-    def __init__(self, sender: subprocess.Popen[str], receiver: subprocess.Popen[str]) -> None:
-        self._sender = sender
-        self.came: set[int] = set()
-        self._listening = threading.Thread(target=self._listen, args=(receiver,), daemon=True)
-        self._listening.start()
-
-    def end(self) -> None:
-        """Once the receiver has ended."""
-        self._listening.join()
-
-    def send(self, first: int, count: int, *, pause_s: float = 0.0) -> dict[int, float]:
-        """The Unix time at which each had been sent."""
-        self._sender.stdin.write(json.dumps([first, count, pause_s]) + "\n")
-        self._sender.stdin.flush()
-        return dict(json.loads(self._sender.stdout.readline()))
-
-    def until(self, true) -> None:
-        """Wait until what has come is such."""
-        eventually(lambda: true(self.came), what=f"came: {sorted(self.came)}")
-
-    def _listen(self, receiver: subprocess.Popen[str]) -> None:
-        for line in receiver.stdout:
-            self.came.add(int(line))
-
-
 @contextmanager
 def datagrams(link: Tunnel):
-    """A sender at the edge and a receiver at the ground."""
+    """Numbered datagrams from edge to ground: what sends so many and says the Unix time of each; and which came."""
+    came: set[int] = set()
     with program(link, "ground", LISTEN) as far, program(link, "edge", UTTER, GROUND_HOST) as near:
-        between = Datagrams(near, far)
+
+        def send(first: int, count: int, *, pause_s: float = 0.0) -> dict[int, float]:
+            near.stdin.write(json.dumps([first, count, pause_s]) + "\n")
+            near.stdin.flush()
+            return dict(json.loads(near.stdout.readline()))
+
+        listening = threading.Thread(target=lambda: came.update(map(int, far.stdout)), daemon=True)
+        listening.start()
         try:
-            yield between
+            yield send, came
         finally:
             far.kill()
-            between.end()
+            listening.join()
 
 
 def test_tcp_brings_every_byte_through_loss():
@@ -205,15 +183,15 @@ def test_darkness_is_dark():
 def dark(light_s: float) -> bool:
     """Whether of what was sent before the last half of the darkness nothing has come, when later things have."""
     there, away = LinkState(5_000_000, delay_s=0.02), LinkState(5_000_000, delay_s=0.02, dark=True)
-    with tunnel(script((0, away), (light_s, there))) as link, datagrams(link) as wire:
-        wire.send(0, 10)
-        wire.until(lambda came: came == set(range(10)))
+    with tunnel(script((0, away), (light_s, there))) as link, datagrams(link) as (send, came):
+        send(0, 10)
+        eventually(lambda: came == set(range(10)), what="all came")
         began_s = link.begin()
-        sent = wire.send(10, 50, pause_s=0.01)
+        sent = send(10, 50, pause_s=0.01)
         in_darkness = {number for number, at_s in sent.items() if at_s < began_s + light_s / 2}
         later = itertools.count(60)
-        eventually(lambda: wire.send(next(later), 1, pause_s=0.05) and max(wire.came) >= 60)
-        return bool(in_darkness) and not wire.came & in_darkness and link.up.dropped >= len(in_darkness)
+        eventually(lambda: send(next(later), 1, pause_s=0.05) and max(came) >= 60)
+        return bool(in_darkness) and not came & in_darkness and link.up.dropped >= len(in_darkness)
 
 
 def test_the_seed_says_which_packets_are_lost():
@@ -222,45 +200,39 @@ def test_the_seed_says_which_packets_are_lost():
     wanted, numbers = script((0, rough)), range(300)
     pipe = Pipe(wanted, seed="7-up")
     expected = {number for number in numbers if pipe.datagram(UTTERED_BYTES, 0.001 * number) is not None}
-    with tunnel(wanted, seed=7) as link, datagrams(link) as wire:
+    with tunnel(wanted, seed=7) as link, datagrams(link) as (send, came):
         link.begin()
         time.sleep(0.2)
-        wire.send(0, len(numbers), pause_s=0.001)
-        wire.until(lambda came: came >= expected)
+        send(0, len(numbers), pause_s=0.001)
+        eventually(lambda: came >= expected, what="what is expected came")
         time.sleep(0.2)  # for any that should not come
-        assert wire.came == expected
+        assert came == expected
     assert 50 < len(expected) < 290
 
 
 def test_nothing_is_left_behind():
     """The machine would fill with namespaces, devices, descriptors and threads."""
     with tunnel(script((0, LinkState(5_000_000)))) as link:
-        there = subprocess.run(
-            [*link.prefix("edge"), "ip", "link"], capture_output=True, text=True, check=True
-        )
-        assert link.devices["edge"] in there.stdout
+        there = subprocess.check_output([*link.prefix("edge"), "ip", "link"], text=True)
+        assert link.devices["edge"] in there
         names = list(link.names.values())
         assert all(name in _namespaces() for name in names)
         assert [target for target in _open_files() if "/dev/net/tun" in target]
     assert not any(name in _namespaces() for name in names)
-    left = subprocess.run(["ip", "link"], capture_output=True, text=True, check=True).stdout
+    left = subprocess.check_output(["ip", "link"], text=True)
     assert not any(device in left for device in link.devices.values())
     assert not any("/dev/net/tun" in target for target in _open_files())
     assert "link-tunnel" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_without_the_device_it_says_so_and_leaves_nothing():
-    """In a container without /dev/net/tun `make link CARRIER=tun` would end in a traceback."""
+def test_without_what_it_needs_it_says_so_and_leaves_nothing(monkeypatch):
+    """In a container without /dev/net/tun, or without iproute2, `make link CARRIER=tun` would end in a traceback."""
     with tunnel(script((0, LinkState(1)))):
         pass
     one = Tunnel(script((0, LinkState(1))), clone="/nonexistent/tun")
     with pytest.raises(UnavailableError, match="/nonexistent/tun"), one:
         pass
     assert not any(name in _namespaces() for name in one.names.values())
-
-
-def test_what_is_missing_is_named(monkeypatch):
-    """As above, on a laptop without iproute2."""
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(UnavailableError, match="needs the command ip"), Tunnel(script((0, LinkState(1)))):
         pass
@@ -273,10 +245,8 @@ def test_what_breaks_on_the_way_is_heard_of():
         with tunnel(script((0, LinkState(5_000_000)))) as link:
             subprocess.run(["ip", "netns", "delete", link.names["ground"]], check=True)
             subprocess.run([*link.prefix("edge"), sys.executable, "-c", SHOUT, GROUND_HOST], check=False)
-            eventually(
-                lambda: "link-tunnel" not in [thread.name for thread in threading.enumerate()],
-                what="the carrier ends",
-            )
+            names = lambda: [thread.name for thread in threading.enumerate()]  # noqa: E731
+            eventually(lambda: "link-tunnel" not in names(), what="the carrier ends")
 
     with pytest.raises(OSError, match="in bad state"):
         broken()
@@ -328,7 +298,7 @@ def test_edge_and_ground_fly_over_the_kernels_own_packets(tmp_path, carrier, nam
 
 
 def _namespaces() -> str:
-    return subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+    return subprocess.check_output(["ip", "netns", "list"], text=True)
 
 
 def _open_files() -> list[str]:

@@ -5,14 +5,10 @@ kernel's netem is often not there, so delay, jitter and reordering are left out:
 random loss are lost is drawn by the kernel; bursts come from the script and its seed.
 """
 
-from __future__ import annotations
-
 import time
 
-from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
+from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, command
 from lab.link.timeline import LinkState, Script
-
-__all__ = ["GROUND_HOST", "Namespaces", "UnavailableError"]
 
 _TBF_BURST_BYTES = 3200
 _RULE = ("INPUT", "-i")
@@ -39,23 +35,17 @@ class Namespaces(Sides):
         return time.time()
 
     def _build(self) -> None:
-        edge, ground = self.names["edge"], self.names["ground"]
-        command(
-            *["ip", "link", "add", "veth-e", "netns"],
-            edge,
-            *["type", "veth", "peer", "name", "veth-g", "netns"],
-            ground,
-        )
+        edge, ground, first = self.names["edge"], self.names["ground"], self._script.still().at(0)
+        peer = ("type", "veth", "peer", "name", "veth-g", "netns", ground)
+        command("ip", "link", "add", "veth-e", "netns", edge, *peer)
         for name, end, host in ((edge, "veth-e", EDGE_HOST), (ground, "veth-g", GROUND_HOST)):
             command("ip", "-n", name, "address", "add", f"{host}/30", "dev", end)
             # Without this the shaper meets 64 kB super-packets, as no real link carries them.
             command("ip", "-n", name, "link", "set", "dev", end, "gso_max_segs", "1")
             command("ip", "-n", name, "link", "set", end, "up")
             command("ip", "netns", "exec", name, "iptables", "-A", *_RULE, end, "-j", "ACCEPT")
-            command(
-                "tc", "-n", name, "qdisc", "add", "dev", end, "root", *self._tbf(self._script.still().at(0))
-            )
-        self._state = self._script.still().at(0)
+            command("tc", "-n", name, "qdisc", "add", "dev", end, "root", *self._tbf(first))
+        self._state = first
 
     def _play(self, began_s: float) -> None:
         for phase in self._script.phases:

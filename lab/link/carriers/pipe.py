@@ -15,8 +15,6 @@ acknowledgements take nothing of the rate, but are lost like all else; a connect
 darkness goes on at the first of its doubling retransmissions after it.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections import deque

@@ -8,8 +8,6 @@ Memory is bounded: one queue of the script's size a direction, and for each of a
 flight. Where the queue is full, TCP is not read (back-pressure to the sender's socket), UDP is dropped.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib
@@ -20,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Literal, Self
 
 from hvt_common.errors import exit_with_sentence
@@ -92,9 +89,7 @@ class Relay:
             raise self._error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: object, _trace: object) -> None:
         if self._thread.is_alive():
             with contextlib.suppress(RuntimeError):  # it may just have ended by itself
                 self._loop.call_soon_threadsafe(self._stop.set)
@@ -264,7 +259,6 @@ class _Datagrams:
         self._loop.add_reader(near, self._from_client)
 
     def close(self) -> None:
-        """Read no more."""
         for one in (self._near, *self._clients.values()):
             self._loop.remove_reader(one)
 

@@ -1,19 +1,15 @@
-"""Two network namespaces, one for the edge and one for the ground: the common base of carriers of real packets.
+"""Network namespaces, one for the edge and one for the ground: the common base of carriers of real packets.
 
 A carrier joins the two in `_build` and may let threads work (`_start`); whatever goes wrong, nothing is left behind.
 """
-
-from __future__ import annotations
 
 import os
 import secrets
 import shutil
 import subprocess
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import ClassVar, Self
 
 EDGE_HOST = "10.98.0.1"
@@ -25,8 +21,8 @@ class UnavailableError(Exception):
     """Namespaces are not to be had here; the text says why."""
 
 
-class Sides(ABC):
-    """One namespace for the edge, one for the ground. A context manager that removes both.
+class Sides:
+    """One namespace for the edge, one for the ground, unless others are named. A context manager that removes them.
 
     Attributes:
         names: of the namespaces, by side.
@@ -38,25 +34,25 @@ class Sides(ABC):
     _needs: ClassVar[tuple[str, ...]] = ("ip",)
     """The commands without which it cannot be."""
 
-    def __init__(self) -> None:
+    def __init__(self, names: Mapping[str, str] | None = None) -> None:
         self._token = secrets.token_hex(3)
         stem = f"hvt-link-{os.getpid()}-{self._token}"
-        self.names = {"edge": f"{stem}-e", "ground": f"{stem}-g"}
+        self.names = names or {"edge": f"{stem}-e", "ground": f"{stem}-g"}
         self._stop = threading.Event()
         self._error: BaseException | None = None
         self._worker: threading.Thread | None = None
 
     def prefix(self, side: str) -> list[str]:
-        """The words before a command that is to run on this side (``edge`` or ``ground``)."""
+        """The words before a command that is to run on this side."""
         return ["ip", "netns", "exec", self.names[side]]
 
-    @abstractmethod
     def begin(self) -> float:
         """The script begins now; return the Unix time."""
+        raise NotImplementedError
 
-    @abstractmethod
     def _build(self) -> None:
-        """Join the two namespaces, which are there and empty."""
+        """Join the namespaces, which are there and empty."""
+        raise NotImplementedError
 
     def __enter__(self) -> Self:
         for tool in self._needs:
@@ -79,9 +75,7 @@ class Sides(ABC):
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: object, _trace: object) -> None:
         self._leave()
         if self._error is not None and error is None:
             raise self._error

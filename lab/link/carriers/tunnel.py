@@ -16,10 +16,8 @@ import time
 from collections.abc import Iterator
 
 from lab.link.carriers.pipe import Pipe
-from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
+from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, command
 from lab.link.timeline import Script
-
-__all__ = ["GROUND_HOST", "Flight", "Tunnel", "UnavailableError"]
 
 _TUNSETIFF = 0x400454CA
 _IFF_TUN = 0x0001

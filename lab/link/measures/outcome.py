@@ -1,7 +1,5 @@
 """The results of a run for the link's users: numbers from arrivals, summaries and samples, and whether bars hold."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -87,7 +85,6 @@ class Outcome:
 
     @property
     def shown(self) -> list[Arrival]:
-        """Those that were decoded."""
         return [one for one in self.frames if one.shown]
 
     @property
@@ -97,7 +94,6 @@ class Outcome:
 
     @property
     def ended_s(self) -> float:
-        """When the script ended."""
         return self.began_s + self.script.lasts_s
 
 

@@ -1,7 +1,5 @@
 """One picture of all runs: the rates of link and sender over time, and below them the ages of arrivals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,14 +1,11 @@
 """Samples memory, descriptors and threads of running processes."""
 
-from __future__ import annotations
-
 import csv
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -45,7 +42,6 @@ class ResourceSampler:
         self._thread = threading.Thread(target=self._run, name="link-watch")
 
     def save(self, path: Path) -> None:
-        """As a table over time."""
         with path.open("w", newline="", encoding="ascii") as file:
             table = csv.writer(file)
             table.writerow(("process", "unix_s", "resident_mb", "descriptors", "threads"))
@@ -58,9 +54,7 @@ class ResourceSampler:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._stop.set()
         self._thread.join(10)
 

@@ -7,11 +7,10 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
-_COLUMNS = ("scenario", "measure", "value", "bar", "holds")
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 def row(scenario: str, measure: str, value: float | None, bar: str | None) -> dict[str, Any]:
@@ -35,15 +34,15 @@ def holds(value: float | None, bar: str) -> bool:
 
 
 def table(rows: Sequence[dict[str, Any]], *, title: str) -> Table:
-    """For the terminal."""
+    """For the terminal: the first column, measure, value, bar, holds."""
+    from rich.table import Table  # the bars alone are for any Python
+
     found = Table(title=title, title_justify="left")
-    for name in _COLUMNS:
-        found.add_column(name, justify="left" if name in ("scenario", "measure") else "right")
-    for one in rows:
-        value = one["value"]
-        shown = f"{value:.2f}" if isinstance(value, float) else "" if value is None else str(value)
-        sign = {True: "yes", False: "NO", None: ""}[one["holds"]]
-        found.add_row(one["scenario"], one["measure"], shown, one["bar"] or "", sign)
+    for name in rows[0]:
+        found.add_column(name, justify="right" if name in ("value", "bar", "holds") else "left")
+    for *of, value, bar, holds_ in (one.values() for one in rows):
+        shown = f"{value:.3f}" if isinstance(value, float) else "" if value is None else str(value)
+        found.add_row(*of, shown, bar or "", {True: "yes", False: "NO", None: ""}[holds_])
     return found
 
 

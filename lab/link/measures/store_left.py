@@ -1,7 +1,5 @@
 """The store of a killed edge, read as the next start of the edge would read it."""
 
-from __future__ import annotations
-
 import secrets
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reads the table of `hvt-ground --timing` (see `hvt_ground.sinks.event_tables`)."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +22,6 @@ class Arrival:
 
     @property
     def delay_s(self) -> float:
-        """Capture to receive."""
         return self.received_s - self.capture_s
 
 
