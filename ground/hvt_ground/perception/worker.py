@@ -45,7 +45,8 @@ _JOB_STEP_S = 0.1
 _STEP_LAG = 2
 """In lockstep a step, or a pose, counts from 2 frames on. It is sent right before the next access unit, which
 may overtake it by microseconds: this makes the order the same in every run."""
-_AHEAD = 2
+_AHEAD = 6
+"""Pictures that in lockstep are decoded while one is searched: a detection takes as long as some five of them."""
 
 Analyze = Callable[[DecodedFrame, bool, threading.Event | None], None]
 """Called with a picture, whether to hurry, and an event that is set once anything comes (None: all is waited for)."""
