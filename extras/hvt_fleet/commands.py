@@ -97,7 +97,7 @@ def _described(still: RequestedStill) -> str:
 
 
 def _tracks(edge: RemoteEdge) -> None:
-    tracks = edge.tracks(on_note=lambda note: say(f"{edge.name}: {note}"))
+    tracks = edge.tracks(on_note=lambda note: print(shown_text(f"{edge.name}: {note}")))
     print(f"{'track':>6}  {'class':<14} {'conf':>4}  x,y,w,h in source pixels")
     for one in tracks:
         x1, y1, x2, y2 = one.box_source_px

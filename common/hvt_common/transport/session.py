@@ -142,12 +142,12 @@ def subscribe(
     """
 
     def receive(sample: zenoh.Sample) -> None:
-        received_ns = clock()
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
         key, attachment = str(sample.key_expr), sample.attachment
-        extra = b"" if attachment is None else attachment.to_bytes()
         try:
+            received_ns = clock()
+            if sample.kind != zenoh.SampleKind.PUT:
+                return
+            extra = b"" if attachment is None else attachment.to_bytes()
             put(Received(key, sample.payload.to_bytes(), extra, str(sample.encoding), received_ns))
         except Exception as error:
             if on_error is None:

@@ -12,6 +12,7 @@ from typing import Any, Protocol, Self
 
 import zenoh
 
+from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import (
     ControlAnswer,
@@ -140,7 +141,11 @@ class ZenohLink:
         # A report goes about once a second.
         if channel is Channel.STATUS and self._deaf.is_set():
             self._stack.close()
-            self._open()
+            try:
+                self._open()
+            except (UserError, zenoh.ZError) as error:  # a file of the link's is gone, or its port taken
+                self._failures.failed("listener", str(error))
+                self._deaf.set()
         with suppress(zenoh.ZError):
             if channel is Channel.STATUS and self._listener is not None and self._loses():
                 self._listener.declare_again(there=self.has_ground())

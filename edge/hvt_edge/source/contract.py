@@ -99,7 +99,7 @@ class Source(ABC):
         """
 
     def steps(self, *, start_ns: int) -> Iterator[Frame | None]:
-        """`frames`, with None for each second in which a live source has none."""
+        """`frames`, with None for each quarter of a second in which a live source has none."""
         yield from self.frames(start_ns=start_ns)
 
     def close(self) -> None:

@@ -127,6 +127,7 @@ class StillWorker:
     def close(self) -> None:
         """Let the threads finish their queued work, at most for ``finish_s``, then give up the rest; join them."""
         until_s = time.monotonic() + self.finish_s
+        self.serve_requested()
         with contextlib.suppress(queue.Full):
             self._frames.put(None, timeout=self.finish_s)
         self._thread.join(timeout=max(0.0, until_s - time.monotonic()))

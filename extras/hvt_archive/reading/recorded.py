@@ -59,7 +59,6 @@ _ODD = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeErro
 
 _Rows = dict[tuple[str, str], SpooledRows]
 """By entity and component."""
-"""By entity and component; components that grow with the flight are on disk."""
 
 
 @dataclass(frozen=True)

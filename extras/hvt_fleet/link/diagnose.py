@@ -146,8 +146,9 @@ class Watch(LinkWatch):
                 return True
             try:
                 links = self._session.info.links()
-                for name in [name for name in self._unserved if self._served(name)]:
-                    _log.warning("%s", self._unserved.pop(name))
+                served = [name for name in self._unserved if self._served(name)]
+                for sentence in dict.fromkeys(self._unserved.pop(name) for name in served):
+                    _log.warning("%s", sentence)
                 if links:
                     self._check_names(self._names(links), now_s)
                 self._check_second_link(links, now_s)

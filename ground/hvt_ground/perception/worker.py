@@ -46,7 +46,7 @@ _STEP_LAG = 2
 """In lockstep a step, or a pose, counts from 2 frames on. It is sent right before the next access unit, which
 may overtake it by microseconds: this makes the order the same in every run."""
 _AHEAD = 6
-"""Pictures that in lockstep are decoded while one is searched: a detection takes as long as some five of them."""
+"""Most pictures, and other turns, that in lockstep wait for one: a detection takes as long as some five decodings."""
 
 Analyze = Callable[[DecodedFrame, bool, threading.Event | None], None]
 """Called with a picture, whether to hurry, and an event that is set once anything comes (None: all is waited for)."""
@@ -295,7 +295,7 @@ class RealtimeWorker(_Worker):
 
 
 class LockstepWorker(_Worker):
-    """Analyzes one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
+    """Analyzes one frame while the next are decoded, in order, waiting for it rather than passing anything over."""
 
     stills_queued, accepts_jobs = 0, True
 
@@ -307,12 +307,17 @@ class LockstepWorker(_Worker):
         self._poses: deque[tuple[int, Callable[[], None]]] = deque(maxlen=_MOST_POSES)
         self._captures_ns: deque[int] = deque(maxlen=_STEP_LAG)
         """Capture times of the last pictures."""
-        self._newest_frame = -1
+        self._newest_frame, self._ahead = -1, _AHEAD
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-perception-{name}")
 
     @property
     def idle(self) -> bool:
         return all(future.done() for future in self._pending)
+
+    def raise_error(self) -> None:
+        super().raise_error()
+        while self._pending and self._pending[0].done():
+            self._pending.popleft().result()
 
     def picture(self, picture: DecodedFrame) -> None:
         """Analyze a frame, and read the stills of it that overtook it on the link."""
@@ -321,6 +326,7 @@ class LockstepWorker(_Worker):
         self._captures_ns.append(picture.capture_ns)
         self._take_steps(before=picture.frame_index - _STEP_LAG + 1)
         self._newest_frame = picture.frame_index
+        self._ahead = max(2, min(_AHEAD, _MOST_PICTURE_BYTES // picture.picture.nbytes))
         self._submit(self._worker.submit(self._analyze, picture, False, None))
         known = [one for one in self._early if one.header.frame_index <= self._newest_frame]
         if known:
@@ -371,7 +377,7 @@ class LockstepWorker(_Worker):
 
     def _submit(self, future: Future[None]) -> None:
         self._pending.append(future)
-        while len(self._pending) > _AHEAD:
+        while len(self._pending) > self._ahead:
             self._pending.popleft().result()
 
     def _do(self, job: Job) -> None:

@@ -104,9 +104,11 @@ class GroundLink:
             self._group.release(port.edge)
 
     def is_known(self, edge: str) -> bool:
-        """Whether this edge has shown itself, by its token or a message."""
+        """Whether this edge, or any where it is "", has shown itself by its token or a message."""
         with self._lock:
-            return edge in self._ports or edge in self._alive
+            return (
+                edge in self._ports or edge in self._alive or (not edge and bool(self._ports or self._alive))
+            )
 
     def __enter__(self) -> Self:
         return self

@@ -174,6 +174,7 @@ def test_without_the_extra_a_codec_names_what_to_install(name, package, monkeypa
     [
         ("jxl", "hvt_codecs.jxl.find_spec", None, r"it comes with the extra hvt\[jxl\]"),
         ("avif", "cv2.haveImageWriter", False, r"OpenCV .* is built without avif"),
+        ("webp", "cv2.haveImageWriter", False, r"OpenCV .* is built without webp"),
     ],
 )
 def test_what_does_not_work_here_says_so(name, place, nothing, says, monkeypatch):

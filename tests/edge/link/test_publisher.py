@@ -11,6 +11,7 @@ from unittest.mock import MagicMock
 import msgpack
 import zenoh
 
+from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import WIRE_VERSION, Feedback, Message
 from hvt_common.runtime.failures import Failures
@@ -134,22 +135,29 @@ def test_who_wants_reports_alone_gets_them_over_udp(free_port):
         eventually(lambda: came)
 
 
+def refused(*_: object, **__: object) -> None:
+    raise UserError("its key has gone")
+
+
 def test_an_edge_whose_listener_hears_nothing_any_more_makes_its_link_anew(free_port, monkeypatch, caplog):
     """No picture would come any more once its radio was plugged in anew: it had to be restarted by hand."""
-    there, answers = socket.if_nameindex(), iter([[]])
-    monkeypatch.setattr(socket, "if_nameindex", lambda: next(answers, there))
-    came, asked = [], []
+    there, anew = socket.if_nameindex(), "since its interface was removed: the link is made anew"
+    monkeypatch.setattr(socket, "if_nameindex", lambda: there if anew in caplog.text else [])
+    came, asked, failures = [], [], Failures(time.time_ns)
     told = publisher.Answers(
         info=lambda _received_ns: b"yes", control=lambda _request: ANSWER, on_feedback=asked.append
     )
     with publisher.ZenohLink(
         LinkSettings("edge", listen=(f"tcp/127.0.0.1:{free_port}#iface=lo",)),
         edge_id="uav-1",
-        failures=Failures(time.time_ns),
+        failures=failures,
         clock=time.time_ns,
     ) as link:
         link.listen(told)
-        eventually(lambda: "since its interface was removed: the link is made anew" in caplog.text)
+        eventually(lambda: anew in caplog.text)
+        with monkeypatch.context() as gone:
+            gone.setattr(publisher, "open_session", refused)
+            eventually(lambda: link.put(Channel.STATUS, b"x") or "its key has gone" in failures.now[0].reason)
         link.put(Channel.STATUS, b"x")
         eventually(lambda: "listener: works again" in caplog.text)
         with joined(f"tcp/127.0.0.1:{free_port}") as ground:

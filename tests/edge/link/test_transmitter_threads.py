@@ -6,6 +6,7 @@ import random
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import count
 
 import pytest
@@ -76,27 +77,29 @@ def test_a_still_that_lost_its_room_waits_until_there_is_some():
     assert rig.ledger.worst_window_bps.total <= TOTAL
 
 
-def test_a_still_whose_put_blocks_holds_up_no_base_frame():
-    """One still into a full link would freeze the picture for as long as the link stays full."""
+@pytest.mark.parametrize("what", [Channel.ROI, Channel.BACKLOG])
+def test_what_blocks_in_its_put_holds_up_no_base_frame(what):
+    """One still, or stored piece, into a full link would freeze the picture for as long as the link stays full."""
     rig, blocked, entered = Rig(), threading.Event(), threading.Event()
 
     def block(channel: Channel) -> None:
-        if channel is Channel.ROI:
+        if channel is what:
             entered.set()
             assert blocked.wait(60)
 
     rig.out.before_put = block
-    thread = threading.Thread(target=rig.still, args=[0, 5_000])
+    still, piece = partial(rig.still, 0, 5_000), partial(rig.backlog, 5_000)
+    thread = threading.Thread(target=still if what is Channel.ROI else piece)
     thread.start()
     assert entered.wait(60)
     for index in range(30):  # two seconds of video
         at_ns = NOW_NS + index * S // 15
         rig.sender.base(AccessUnit(index, at_ns, bytes(1_500), False), now_ns=at_ns)
         assert rig.waits[-1] == at_ns, "it does not wait for the budget either"
-    assert thread.is_alive(), "the still is blocked all the while"
+    assert thread.is_alive(), "it is blocked all the while"
     blocked.set()
     thread.join()
-    assert [channel for channel, _, _ in rig.out.puts] == [Channel.BASE] * 30 + [Channel.ROI]
+    assert [channel for channel, _, _ in rig.out.puts] == [Channel.BASE] * 30 + [what]
 
 
 def frames(rig: Rig, clock: Clock) -> Iterator[None]:

@@ -49,9 +49,10 @@ def quarters(monkeypatch):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
 
 
-def stops(grabber, url: str, says: str) -> None:
+def stops(grabber, url: str, says: str, *, shows: bool = False) -> None:
     camera = grabber(url)
     camera.open()
+    assert not shows or camera.grab()
     with pytest.raises(SignalLost, match=says):
         all(iter(camera.grab, None))
     camera.close()
@@ -62,7 +63,7 @@ def test_a_camera_of_which_sound_alone_goes_on_has_stopped(monkeypatch, grabber,
     """It would never be opened again: where a camera's encoder hangs, its microphone or its telemetry does not."""
     connection = av.open(film_that_stops())
     monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)
-    stops(grabber, "tcp://camera", "no picture")
+    stops(grabber, "tcp://camera", "no picture", shows=True)
 
 
 def test_a_stream_that_comes_in_segments_is_played_by_its_own_time(tmp_path, monkeypatch):

@@ -165,6 +165,17 @@ def test_in_lockstep_a_pose_counts_from_the_same_frame_on_however_long_perceptio
     assert done == [0, 1, 2, "pose", 3, 4, "pose", 5]
 
 
+def test_in_lockstep_an_analysis_that_fails_is_raised_at_once():
+    """An edge of few frames a second waits for its ground, and would end as if that had gone."""
+    worker = LockstepWorker(lambda *_: 1 / 0, lambda *_: None, lambda _: None, name="x")
+    worker.picture(picture(0))
+    eventually(lambda: worker.idle)
+    with pytest.raises(ZeroDivisionError):
+        worker.raise_error()
+    worker.raise_error()  # once
+    worker.close()
+
+
 def test_large_pictures_that_wait_have_a_bound_in_bytes():
     """A picture of 8192x4352 costs an edge a hundred bytes, and the ground 53 MB: twelve would fill it."""
     rig = Rig()

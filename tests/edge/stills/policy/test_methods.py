@@ -130,6 +130,12 @@ def test_a_method_wants_what_it_says_in_its_order(policy, cars, wanted):
     assert [one.candidate.track_id for one in requests] == wanted
 
 
+def test_a_new_object_is_called_so_and_is_no_overdue_one():
+    """Summary and recording give the reason, and long-known objects would wait behind each newcomer."""
+    (of_m1,), (of_m2,) = (method(name).requests([car(1, **NEW)], step()) for name in ("M1", "M2"))
+    assert (of_m1.score, of_m2.reason) == (0, "new")
+
+
 def test_m0_and_r0_leave_the_whole_budget_to_the_video():
     assert [name for name in METHODS if method(name).video_only] == ["M0", "R0"]
 

@@ -100,6 +100,7 @@ NOBODY = "nobody listens on port {free} there: is the other side running?"
         (b"", "tcp/127.0.0.1:{free}", NOBODY),
         (b"", "tls/127.0.0.1:{free}", NOBODY),
         pytest.param(b"", "tcp/[::1]:{free}", NOBODY, marks=NEEDS_IPV6),
+        pytest.param(b"", "tls/[::1]:{free}", NOBODY, marks=NEEDS_IPV6),
         (b"", "tls/no-such-host.invalid:7447", UNKNOWN),
         (b"", "quic/no-such-host.invalid:7447", UNKNOWN),
         (b"", f"tcp/{'a' * 64}:7447", f"'{'a' * 64}' is no name that a machine can have"),

@@ -318,7 +318,7 @@ def test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, password, monke
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_certificate_and_locked_key_may_be_in_one_file(fleet, tmp_path):
+def test_certificate_and_key_may_be_in_one_file_locked_or_not(fleet, tmp_path):
     """As many programs write them; OpenSSL would ask for the password at the terminal, and the ground wait."""
     key: Any = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
     locked = serialization.BestAvailableEncryption(b"atakatak")
@@ -327,10 +327,12 @@ def test_certificate_and_locked_key_may_be_in_one_file(fleet, tmp_path):
         key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, locked)
         + (fleet.folder / "client.pem").read_bytes()
     )
-    said = keys(fleet, TLS_CLIENT_CERT=str(both), TLS_CLIENT_KEY="")
+    url, said = "tls://takserver.example:8089", keys(fleet, TLS_CLIENT_CERT=str(both), TLS_CLIENT_KEY="")
     with pytest.raises(UserError, match=r"both\.pem has an encrypted key: set PYTAK_TLS_CLIENT_PASSWORD"):
-        check_connection("tls://takserver.example:8089", said)
-    check_connection("tls://takserver.example:8089", {**said, "PYTAK_TLS_CLIENT_PASSWORD": "atakatak"})
+        check_connection(url, said)
+    check_connection(url, {**said, "PYTAK_TLS_CLIENT_PASSWORD": "atakatak"})
+    both.write_bytes(b"".join((fleet.folder / f"client.{one}").read_bytes() for one in ("key", "pem")))
+    check_connection(url, said)
 
 
 @pytest.mark.parametrize(
