@@ -11,12 +11,13 @@ from pathlib import Path
 
 from rerun.chunk import Chunk
 
+from hvt_archive.reading.readable import id_of
 from hvt_archive.reading.recorded import readable_part
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
-from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
+from hvt_ground.sinks.rerun.rrd_file import open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 _FLUSH_S = 10.0

@@ -15,9 +15,9 @@ from typing import Any
 
 from rerun.chunk import Chunk
 
+from hvt_archive.reading.readable import drop_footer, id_of, readable
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks.rerun.readable import readable
-from hvt_ground.sinks.rerun.rrd_file import drop_footer, id_of, open_rrd
+from hvt_ground.sinks.rerun.rrd_file import open_rrd
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 from hvt_ground.sinks.rerun.stills import still_of_event
 

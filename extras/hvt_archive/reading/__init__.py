@@ -1,1 +1,1 @@
-"""Recordings read back: `recorded` opens the files of a session; large parts stay on disk."""
+"""Recordings read back: `recorded` opens the files of a session, `readable` a damaged one; much stays on disk."""

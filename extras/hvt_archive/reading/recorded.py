@@ -19,6 +19,7 @@ import numpy as np
 from rerun.chunk import Chunk
 
 from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer, of_file
+from hvt_archive.reading.readable import has_holes, id_of, readable, what_is_read
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_common.errors import UserError, telling
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
@@ -40,8 +41,7 @@ from hvt_ground.sinks.rerun.blueprint import (
     VIDEO,
 )
 from hvt_ground.sinks.rerun.map_rows import pose_of
-from hvt_ground.sinks.rerun.readable import has_holes, readable, what_is_read
-from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
+from hvt_ground.sinks.rerun.rrd_file import open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId
 from hvt_ground.sinks.rerun.stills import refined_by_event
 

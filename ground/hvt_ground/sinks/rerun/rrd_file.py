@@ -15,13 +15,12 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
-import re
 import shutil
 import struct
 import threading
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -37,12 +36,10 @@ from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_rec
 
 _log = logging.getLogger(__name__)
 
-STREAM_MAGIC = b"RRF2"
-STREAM_HEADER_BYTES = 12  # with version, compression and serialisation
-_MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of the rest
-_END, _CHUNK, _LAST_KIND = 0, 2, 3
-_CHUNK_KIND = _CHUNK.to_bytes(8, "little")
-_BLOCK_BYTES = 2**16
+STREAM_HEADER_BYTES = 12  # the magic number, version, compression and serialisation
+MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of the rest
+END = 0
+"""The kind of a recording's footer."""
 _SPARE_BYTES = 2 * 2**20
 _FLUSH_S = 10.0
 _LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
@@ -176,60 +173,15 @@ def open_rrd(path: Path) -> RrdReader:
         return RrdReader(path)
 
 
-def id_of(reader: RrdReader) -> RecordingId:
-    """Whose recording it is; `ValueError` where that is not one recording's."""
-    (entry,) = reader.recordings()
-    edge = entry.application_id.removeprefix("hvt-")
-    return RecordingId(edge, entry.recording_id.removeprefix(f"{edge}-"))
-
-
 def _messages(stream: bytes) -> bytes:
     end = at = STREAM_HEADER_BYTES
     while at < len(stream):
-        kind, length = _MESSAGE_HEADER.unpack_from(stream, at)
-        if kind == _END:
+        kind, length = MESSAGE_HEADER.unpack_from(stream, at)
+        if kind == END:
             break
-        at += _MESSAGE_HEADER.size + length
+        at += MESSAGE_HEADER.size + length
         end = at
     return stream[STREAM_HEADER_BYTES:end]
-
-
-def drop_footer(path: Path) -> None:
-    """Take the footer off a recording: it has a row for each chunk, and a small one is mostly that."""
-    with path.open("r+b") as file:
-        file.truncate(max(end for kind, end in whole_messages(file.fileno()) if kind != _END))
-
-
-def whole_messages(file: int) -> Iterator[tuple[int, int]]:
-    """The kind of each message, and where it ends, up to a footer; bytes between them that are none have its kind."""
-    at, size, kind = STREAM_HEADER_BYTES, os.fstat(file).st_size, _CHUNK
-    while kind != _END:
-        found = _message(file, at, size)
-        kind, at = found or (_CHUNK, _next_chunk(file, at, size))
-        if at < 0:
-            return
-        yield (kind if found else _END), at
-
-
-def _message(file: int, at: int, size: int) -> tuple[int, int] | None:
-    # Its kind and where it ends; None if there is none at this place, or not all of it.
-    head = os.pread(file, _MESSAGE_HEADER.size, at)
-    kind, length = _MESSAGE_HEADER.unpack(head) if len(head) == _MESSAGE_HEADER.size else (_END, 0)
-    end = at + _MESSAGE_HEADER.size + length
-    return (kind, end) if kind <= _LAST_KIND and length and end <= size else None
-
-
-def _next_chunk(file: int, at: int, size: int) -> int:
-    # Where damage ends: at a chunk that another message, or nothing, follows. -1 without one in this recording.
-    if os.pread(file, len(STREAM_MAGIC), at) == STREAM_MAGIC:
-        return -1
-    while len(block := os.pread(file, _BLOCK_BYTES, at)) >= len(_CHUNK_KIND):
-        for place in (at + one.start() for one in re.finditer(_CHUNK_KIND, block)):
-            found = _message(file, place, size)
-            if found is not None and (found[1] == size or _message(file, found[1], size)):
-                return place
-        at += len(block) - len(_CHUNK_KIND) + 1
-    return -1
 
 
 def _created(path: Path) -> int:

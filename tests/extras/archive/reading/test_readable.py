@@ -9,7 +9,7 @@ import subprocess
 import pytest
 import rerun as rr
 
-from hvt_ground.sinks.rerun.readable import _Tries, readable, tried
+from hvt_archive.reading.readable import _Tries, readable, tried
 from programs.rrd import damaged
 
 ROWS = 300

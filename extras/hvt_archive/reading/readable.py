@@ -9,19 +9,26 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import re
 import resource
 import select
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from hvt_ground.sinks.rerun.rrd_file import STREAM_HEADER_BYTES, id_of, open_rrd, whole_messages
+from rerun.chunk import RrdReader
 
-_STORE_INFO = 1
+from hvt_ground.sinks.rerun.rrd_file import END, MESSAGE_HEADER, STREAM_HEADER_BYTES, open_rrd
+from hvt_ground.sinks.rerun.sdk import RecordingId
+
+_MAGIC = b"RRF2"
+_STORE_INFO, _CHUNK, _LAST_KIND = 1, 2, 3
+_CHUNK_KIND = _CHUNK.to_bytes(8, "little")
+_BLOCK_BYTES = 2**16
 _WHOLE, _COPIED, _NOTHING = b"0", b"1", b"2"
 _FOOT_BYTES = 32
 """Between the last message of a recording and its end."""
@@ -120,6 +127,51 @@ def _next_recording(path: Path) -> int:
         end = max((end for _, end in whole_messages(file.fileno())), default=0)
         place = os.pread(file.fileno(), STREAM_HEADER_BYTES + _FOOT_BYTES, end).find(head)
     return end + place if end and place >= 0 else 0
+
+
+def id_of(reader: RrdReader) -> RecordingId:
+    """Whose recording it is; `ValueError` where that is not one recording's."""
+    (entry,) = reader.recordings()
+    edge = entry.application_id.removeprefix("hvt-")
+    return RecordingId(edge, entry.recording_id.removeprefix(f"{edge}-"))
+
+
+def drop_footer(path: Path) -> None:
+    """Take the footer off a recording: it has a row for each chunk, and a small one is mostly that."""
+    with path.open("r+b") as file:
+        file.truncate(max(end for kind, end in whole_messages(file.fileno()) if kind != END))
+
+
+def whole_messages(file: int) -> Iterator[tuple[int, int]]:
+    """The kind of each message, and where it ends, up to a footer; bytes between them that are none have its kind."""
+    at, size, kind = STREAM_HEADER_BYTES, os.fstat(file).st_size, _CHUNK
+    while kind != END:
+        found = _message(file, at, size)
+        kind, at = found or (_CHUNK, _next_chunk(file, at, size))
+        if at < 0:
+            return
+        yield (kind if found else END), at
+
+
+def _message(file: int, at: int, size: int) -> tuple[int, int] | None:
+    # Its kind and where it ends; None if there is none at this place, or not all of it.
+    head = os.pread(file, MESSAGE_HEADER.size, at)
+    kind, length = MESSAGE_HEADER.unpack(head) if len(head) == MESSAGE_HEADER.size else (END, 0)
+    end = at + MESSAGE_HEADER.size + length
+    return (kind, end) if kind <= _LAST_KIND and length and end <= size else None
+
+
+def _next_chunk(file: int, at: int, size: int) -> int:
+    # Where damage ends: at a chunk that another message, or nothing, follows. -1 without one in this recording.
+    if os.pread(file, len(_MAGIC), at) == _MAGIC:
+        return -1
+    while len(block := os.pread(file, _BLOCK_BYTES, at)) >= len(_CHUNK_KIND):
+        for place in (at + one.start() for one in re.finditer(_CHUNK_KIND, block)):
+            found = _message(file, place, size)
+            if found is not None and (found[1] == size or _message(file, found[1], size)):
+                return place
+        at += len(block) - len(_CHUNK_KIND) + 1
+    return -1
 
 
 def main() -> None:
