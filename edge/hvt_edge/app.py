@@ -180,7 +180,7 @@ class Edge:
         heartbeat = stages.heartbeat
         self._counts.begin(source)
         with self._make_pace(source, stages, link) as pace:
-            for frame in source.steps(start_ns=stages.link.operating.now.started_ns):
+            for frame in pace.steps(source.steps(start_ns=stages.link.operating.now.started_ns)):
                 if self._stop.is_set():
                     break
                 stages.status.send_pending()

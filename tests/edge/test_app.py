@@ -80,6 +80,20 @@ def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path)
     assert summary["frames_captured"] == FRAMES
 
 
+def test_a_link_is_mended_while_a_clip_waits_for_its_ground(tmp_path):
+    """No ground could have come any more: a deaf listener was made anew with the first picture alone."""
+    mended: list[bool] = []
+
+    class Waiting(Staged):
+        def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
+            link = super().open_link(stack, config)
+            link.mend = lambda: mended.append(bool(self.reports))
+            return link
+
+    edge(tmp_path, Waiting(lambda _frame: mended.append(True)), wait=0.1).run()
+    assert mended[0] is False
+
+
 def test_an_edge_that_hangs_is_reported(tmp_path):
     """All that was counted would be lost with it, and the reason; and a small board has no memory for threads."""
     hung, goes_on = threading.Event(), threading.Event()

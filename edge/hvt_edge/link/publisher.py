@@ -86,12 +86,15 @@ class EdgeLink(Outlet, Protocol):
         """Answer grounds from now on; called once all parts that answer exist."""
         ...
 
+    def mend(self) -> None:
+        """Called once a second in the frame loop, also while that waits: bring back what the link has lost."""
+        ...
+
 
 class ZenohLink:
     """One Zenoh session with publishers of all channels; a context manager.
 
-    Once a listener hears nothing any more, the next status message goes through another session. Raises `UserError`
-    where a port or an endpoint cannot be used, or another edge with that id is on the link.
+    Raises `UserError` where a port or an endpoint cannot be used, or another edge with that id is on the link.
     """
 
     def __init__(
@@ -138,8 +141,11 @@ class ZenohLink:
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
         """Send one message; blocks while the link is full. A link that is gone drops it without an error."""
-        # A report goes about once a second.
-        if channel is Channel.STATUS and self._deaf.is_set():
+        with suppress(zenoh.ZError):
+            self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
+
+    def mend(self) -> None:
+        if self._deaf.is_set():
             self._stack.close()
             try:
                 self._open()
@@ -147,9 +153,8 @@ class ZenohLink:
                 self._failures.failed("listener", str(error))
                 self._deaf.set()
         with suppress(zenoh.ZError):
-            if channel is Channel.STATUS and self._listener is not None and self._loses():
+            if self._listener is not None and self._loses():
                 self._listener.declare_again(there=self.has_ground())
-            self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
 
     def listen(self, answers: Answers) -> None:
         self._listener = EdgeListener(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass
 from types import TracebackType
@@ -65,6 +65,10 @@ class LockstepPace:
         """(frame index, newest coded index by then, stills sent with it): the expected answers of the ground."""
         self._coded_index = -1
         self._newest_answered = self._newest_analyzed = -1
+
+    def steps(self, frames: Iterable[Frame | None]) -> Iterator[Frame | None]:
+        """``frames`` as they are: no frame waits until it is due."""
+        yield from frames
 
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode this frame while the one before is analyzed; send that one's stills, then this one's unit.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Self
 
@@ -19,6 +19,7 @@ from hvt_common.values import AccessUnit, Frame
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.operating import Keyframes
+from hvt_edge.source.live import IDLE_S
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.reconfigure import EncoderReconfiguration
@@ -95,6 +96,16 @@ class RealtimePace:
             clock=self.clock,
             length=max(2, round(_MOST_QUEUED_S * self.fps)),
         )
+
+    def steps(self, frames: Iterable[Frame | None]) -> Iterator[Frame | None]:
+        """``frames``, with None for each quarter of a second for which a clip's next one is not due."""
+        for frame in frames:
+            while not (self.live or frame is None or self.stop.is_set()):
+                if frame.capture_ns + self.counts.paused_ns - self.clock() <= IDLE_S * SECOND_NS:
+                    break
+                self.stop.wait(IDLE_S)
+                yield None
+            yield frame
 
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it.

@@ -230,10 +230,11 @@ def boxes_age_s(
 
 @dataclass(eq=False)
 class Heartbeat:
-    """The frame loop reports once a second that it turns: a state for watchers, a message for systemd's watchdog.
+    """Each second the frame loop mends the link and reports that it turns: to watchers, and to systemd's watchdog.
 
-    A long wait in the loop turns it meanwhile: a clip waits for its ground, a lost camera yields a step without a
-    frame each second. Only a loop that hangs reports nothing. ``clock`` is wall time, in lockstep too.
+    A long wait in the loop turns it meanwhile: a clip waits for its ground, or for the next of a few frames a second;
+    a lost camera yields steps without a frame. Only a loop that hangs reports nothing. ``clock`` is wall time, in
+    lockstep too.
     """
 
     config: EdgeConfig
@@ -263,6 +264,7 @@ class Heartbeat:
 
     def beat(self, phase: Phase) -> EdgeState:
         self._due_ns = self.clock() + SECOND_NS
+        self.link.mend()
         self.state = self._made(phase)
         notify_systemd("WATCHDOG=1")
         return self.state

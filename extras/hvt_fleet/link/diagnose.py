@@ -224,7 +224,7 @@ class Watch(LinkWatch):
             self._calls_since_s = math.inf
             replies = self._session.liveliness().get(selector(Channel.ALIVE), timeout=_ANSWER_S)
             if not self._served("") and all(one.ok is None for one in replies):
-                self._unserved[""] = "an edge is seen now"
+                self._unserved[""] = "an edge is seen now, there or elsewhere"
                 _log.warning(
                     "linked to %s, but no edge is seen there: if another ground listens there, it passes nothing on; "
                     "connect to the edge itself, or both grounds to a router (docs/deployment.md)",
@@ -253,7 +253,9 @@ class Watch(LinkWatch):
                 sentence = self._stranger(name)
             elif now_s - since_s > self._patience_s and not router and self._is_hiding(name):
                 sentence = self._hidden(name)
-                self._unserved[name] = f"{self._edge or name} and a ground hear each other now"
+                self._unserved[name] = f"{name} and this ground hear each other now"
+                if self._edge is not None:  # Zenoh does not say whose subscription it is
+                    self._unserved[name] = f"a ground hears {self._edge} now: {name!r} or another"
             else:
                 continue
             self._named.add(name)

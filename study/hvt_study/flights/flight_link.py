@@ -203,6 +203,9 @@ class FlightOutlet:
     def has_subscriber(self, channel: Channel) -> bool:  # noqa: ARG002
         return True
 
+    def mend(self) -> None:
+        """It loses nothing."""
+
     def listen(self, answers: Answers) -> None:
         self._on_listen(answers.info(START_NS))
 

@@ -157,8 +157,8 @@ def test_an_edge_whose_listener_hears_nothing_any_more_makes_its_link_anew(free_
         eventually(lambda: anew in caplog.text)
         with monkeypatch.context() as gone:
             gone.setattr(publisher, "open_session", refused)
-            eventually(lambda: link.put(Channel.STATUS, b"x") or "its key has gone" in failures.now[0].reason)
-        link.put(Channel.STATUS, b"x")
+            eventually(lambda: link.mend() or "its key has gone" in failures.now[0].reason)
+        link.mend()
         eventually(lambda: "listener: works again" in caplog.text)
         with joined(f"tcp/127.0.0.1:{free_port}") as ground:
             ground.declare_subscriber("hvt/uav-1/status", came.append)

@@ -135,6 +135,17 @@ def play_clip(
     return pace.counts
 
 
+def test_the_loop_turns_while_a_clip_of_few_frames_waits_for_the_next():
+    """A requested still, a report and a command's rate waited for it: 10 s at one frame in 10 s."""
+    out, turns = Out(), list[int | None]()
+    with paced(out, QuietStills(), fps=0.1) as pace:
+        for frame in pace.steps(framed(smooth_pictures(2, size=SIZE), fps=0.1)):
+            turns.append(frame and frame.index)
+            pace.step(frame)
+    assert turns == [0, *[None] * 39, 1]
+    assert [one.send_delay_ns for one in out.headers] == [0, 0]
+
+
 @pytest.mark.parametrize("reading_s", [0.1, 0.4, 3.0])
 def test_a_clip_that_cannot_be_read_in_real_time_is_played_slower(reading_s):
     """The delay grew for ever (161 s were seen); or capture times, rates and length would be untrue."""

@@ -111,6 +111,9 @@ class LookFlight(World):
         del channel
         return True
 
+    def mend(self) -> None:
+        """It loses nothing."""
+
     def listen(self, answers: Answers) -> None:
         """The edge is ready."""
         self._control = answers.control
