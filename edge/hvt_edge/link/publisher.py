@@ -87,7 +87,7 @@ class EdgeLink(Outlet, Protocol):
         ...
 
     def mend(self) -> None:
-        """Called once a second in the frame loop, also while that waits: bring back what the link has lost."""
+        """Called once a second in the frame loop, also while that waits: restore lost parts of the link."""
         ...
 
 
