@@ -30,7 +30,6 @@ def view(x, y, zoom, degrees):
 
 
 def shot(ground, camera, rng):
-    """What the camera sees, with sensor noise."""
     image = cv2.warpAffine(ground, camera, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
     return np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
 

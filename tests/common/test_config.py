@@ -46,12 +46,10 @@ class Camera:
 
 
 def read(*argv):
-    """What a command line gives."""
     return load(Camera, list(argv), program="camera", description="A camera.")[0]
 
 
 def read_file(folder, text, *argv):
-    """What a file and a command line give."""
     path = folder / "camera.toml"
     path.write_text(text, encoding="utf-8")
     return read("--config", str(path), *argv)

@@ -62,12 +62,10 @@ CUTS = [
 
 @cache
 def scene(name):
-    """Its pictures."""
     return SCENES[name]()
 
 
 def changes(pictures):
-    """The places at which another scene began."""
     change = SceneChange()
     return [k for k, one in enumerate(pictures) if change.take(one)]
 

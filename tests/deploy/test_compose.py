@@ -1,7 +1,5 @@
 """deploy/compose.yaml: read, checked against the real parsers, and its commands run as processes without Docker."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json

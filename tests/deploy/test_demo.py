@@ -1,7 +1,5 @@
 """The demo: what a newcomer sees first."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -36,7 +34,6 @@ class Demo(NamedTuple):
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """Over the first eight seconds of the scene."""
     folder = tmp_path_factory.mktemp("demo")
     command = [sys.executable, str(ROOT / "deploy" / "demo.py"), "--max-frames", "120"]
     done = subprocess.run(

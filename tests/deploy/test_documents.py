@@ -1,7 +1,5 @@
 """What the documents name exists: files, flags, options, make targets; and a page is short enough to be read."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import importlib.util
@@ -106,7 +104,6 @@ def test_links_hold(name: str) -> None:
 
 
 def _anchors(page: Path) -> set[str]:
-    """Of all headings, as GitHub makes them."""
     heads = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
 

@@ -1,7 +1,5 @@
 """The Dockerfile, read line by line, and the wheel that it would install, built from what it copies."""
 
-from __future__ import annotations
-
 import fnmatch
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """Alerts and dashboard name metrics that there are."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

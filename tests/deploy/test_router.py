@@ -1,7 +1,5 @@
 """deploy/router.py as a real process, with messages of two other sessions through it."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket

@@ -1,7 +1,5 @@
 """What the programs tell systemd, on the socket that it gives them."""
 
-from __future__ import annotations
-
 import signal
 import socket
 from collections.abc import Iterator
@@ -18,7 +16,6 @@ pytestmark = pytest.mark.integration
 
 @contextmanager
 def listening(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    """What systemd listens on."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
         bound.bind(name.replace("@", "\0", 1))
         bound.settimeout(PATIENT_S)
@@ -28,7 +25,6 @@ def listening(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.soc
 
 @pytest.fixture
 def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    """A socket that is a file."""
     with listening(str(tmp_path / "notify"), monkeypatch) as bound:
         yield bound
 

@@ -1,7 +1,5 @@
 """The documented way to keys: the files of ``hvt-ground keys``, over real sessions and a real router."""
 
-from __future__ import annotations
-
 import threading
 from contextlib import ExitStack
 from dataclasses import replace

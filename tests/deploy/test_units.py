@@ -1,7 +1,5 @@
 """The systemd units, as systemd and our own parsers read them."""
 
-from __future__ import annotations
-
 import configparser
 import re
 import shlex

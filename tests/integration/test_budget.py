@@ -1,7 +1,5 @@
 """The hard budget, for every method: what the edge sends in any window, on a real clip with a real detector."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

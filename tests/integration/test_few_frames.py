@@ -1,7 +1,5 @@
 """Edge and ground as real processes on a link that is good, at few frames a second."""
 
-from __future__ import annotations
-
 import pytest
 
 from programs.processes import Link

@@ -1,7 +1,5 @@
 """The ledger's bytes against the kernel's, on a link between two network namespaces and on loopback."""
 
-from __future__ import annotations
-
 import array
 import fcntl
 import json
@@ -113,7 +111,6 @@ def test_the_ledger_agrees_with_the_kernel_on_loopback(namespaces):
 
 
 def listen(endpoint: str) -> None:
-    """Subscribe until told to stop."""
     with open_session(LinkSettings("ground", listen=(endpoint,), insecure=True)) as session:
         subscriber = subscribe(session, "hvt/*/base", put=Inbox(capacity=1).put)
         print("up", flush=True)

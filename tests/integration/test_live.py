@@ -1,7 +1,5 @@
 """Real time: grounds and edges that come late, leave, die and come back, while the others go on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,12 +91,10 @@ def late(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
 
 
 def seen(tap: Tap) -> list[BaseHeader]:
-    """The frames that came, in their order."""
     return [BaseHeader.parse(one.attachment, one.payload) for one in tap.messages]
 
 
 def keyframes(tap: Tap, *, after: int) -> list[BaseHeader]:
-    """Those of frames after this one."""
     return [header for header in seen(tap) if header.keyframe and header.frame_index > after]
 
 

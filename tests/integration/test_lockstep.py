@@ -1,7 +1,5 @@
 """Lockstep: the same input gives the same bytes, also where the ground's opinion decides what is sent."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +40,6 @@ class Play:
 
 
 def flown(folder: Path, *, edge_settings: tuple[str, ...], ground_settings: tuple[str, ...] = ()) -> Play:
-    """Edge and ground as two processes."""
     folder.mkdir()
     with Link(folder) as link:
         # By its speed auto may choose one provider this time and another the next, and their answers differ a little.

@@ -1,7 +1,5 @@
 """An outage in media time: the edge's real stages, the laboratory's link, a ground that reports. Nothing sleeps."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,7 +29,6 @@ class DistantGround(Ground):
         """The longest that a message was under way."""
 
     def take(self, *message) -> None:
-        """The edge hands it to its socket."""
         _, payload, attachment = message
         left, segments = len(payload) + len(attachment), []
         while left > 0:
@@ -53,14 +50,12 @@ class DistantGround(Ground):
             super().take(*message)
 
     def report(self, now_ns: int):
-        """What it says of that."""
         self.arrive()
         held_us = round(1e6 * (self.now_s - self._base_came_s))
         return replace(super().report(now_ns), base_held_us=held_us)
 
     @property
     def now_s(self) -> float:
-        """Seconds of the script."""
         return (self._now_ns() - START_NS) / 1e9
 
 

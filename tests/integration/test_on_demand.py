@@ -1,7 +1,5 @@
 """Asking a flying edge for more, through the ground that watches it, from the command line and from Python."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
@@ -25,7 +23,6 @@ PLACE = (300, 100, 200, 150)
 
 
 def refusal(ask) -> str:
-    """The sentence with which the edge says no."""
     with pytest.raises(RefusedError) as caught:
         ask()
     return str(caught.value)

@@ -3,8 +3,6 @@
 That a router goes is in fleet/test_group.py; that two edges of one id meet later in tests/ground/session.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

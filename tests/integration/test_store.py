@@ -1,7 +1,5 @@
 """Edge and ground as real processes over a link that goes away: what was seen meanwhile comes afterwards."""
 
-from __future__ import annotations
-
 import csv
 import time
 from collections.abc import Iterable
@@ -29,7 +27,6 @@ EDGE = (
 
 
 def outage(*, begins_s: float, lasts_s: float) -> Script:
-    """A good link with one hole in it."""
     pieces = (Phase(0.0, LIGHT), Phase(begins_s, DARK), Phase(begins_s + lasts_s, LIGHT))
     return Script(phases=pieces, lasts_s=200.0, queue_bytes=64_000)
 
@@ -69,7 +66,6 @@ SEES = ("--detector", "motion", "--classifier", "none", "--record", "run.rrd", "
 
 
 def edge_of(link: Link, relay: Relay, scene: Path, *settings: str) -> Running:
-    """An edge with a store, behind the relay."""
     connect = ("--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), "--store-folder", "store")
     return link.start("hvt_edge.cli", [*connect, *EDGE, *settings], name="edge")
 

@@ -1,7 +1,5 @@
 """What becomes of a run whose output nobody reads: a closed terminal, a dead pipe, a full disk."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A still codec, a detector, encoders that HVT has never heard of, installed beside it, through the pipeline."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
@@ -23,12 +21,10 @@ STILLS = ("--budget", "1200kbps", "--method", "M5", "--cooldown", "1s")
 
 
 def ground_of(link: Link, detector: str = "aerial-nano") -> Running:
-    """One that records."""
     return link.ground("--once", "--record", "flight.rrd", "--classifier", "none", "--detector", detector)
 
 
 def edge_of(link: Link, scene: Path, *settings: str) -> Running:
-    """Six seconds of the drawn scene."""
     return link.edge(
         *("--source", str(scene), "--fps", "10", "--max-frames", str(FRAMES), "--pace", "lockstep"),
         *("--size", "640x360", "--preset", "ultrafast", "--detector", "motion", "--wait", "60s", *settings),

@@ -25,7 +25,6 @@ def frame(index: int, *, delay_s: float = 0.1, shown: bool = True, size: int = 5
 
 
 def outcome(name: str, frames: list[Arrival], *, sent: int | None = None, store=None) -> Outcome:
-    """What a run with these arrivals would be."""
     sums = {"base_bytes": 1000, "roi_bytes": 10, "backlog_bytes": 7, "meta_bytes": 0, "overhead_bytes": 5}
     edge = {
         **sums,

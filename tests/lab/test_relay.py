@@ -95,7 +95,6 @@ def test_darkness_is_black_for_datagrams():
 
 
 def delivered(segments: list[Segment]) -> list[float]:
-    """When the program gets each: in order."""
     return list(accumulate((segment.arrives_s for segment in segments), max))
 
 

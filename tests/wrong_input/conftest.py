@@ -17,7 +17,6 @@ _PROGRAMS = {"hvt-edge": hvt_edge.cli.main, "hvt-ground": hvt_ground.cli.main}
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """An empty working folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

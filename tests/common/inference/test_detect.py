@@ -45,7 +45,6 @@ def iou(first, second):
 
 
 def empty(rows, columns):
-    """An output in which nothing was found."""
     return np.zeros((1, rows, columns), np.float32)
 
 
@@ -63,7 +62,6 @@ def answering(folder, table, *, metadata=None, **settings):
 
 
 def found_in(folder, table, **settings):
-    """What such a detector finds."""
     return answering(folder, table, **settings).detect(np.zeros((64, 64, 3), np.uint8))
 
 
@@ -270,7 +268,6 @@ def test_what_is_no_image_is_a_bug():
 
 
 def plain_suppression(boxes, scores, classes, limit):
-    """Greedy suppression, word for word."""
     kept: list[int] = []
     for i in sorted(range(len(scores)), key=lambda i: (-scores[i], i)):
         if all(
@@ -523,7 +520,6 @@ def reference(path, image, *, confidence, size):
 
 
 def street(data):
-    """The real aerial picture and its annotation file."""
     picture = data / "visdrone/0000001_02999_d_0000005.jpg"
     return cv2.imread(str(picture)), picture.with_suffix(".txt")
 

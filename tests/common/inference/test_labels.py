@@ -118,7 +118,6 @@ def test_class_lists_have_their_published_sizes_and_order():
 
 
 def of_kinds(names, wanted):
-    """Those names that mean a wanted kind."""
     return {name for name in names if any(same_kind(name, word) for word in wanted)}
 
 

@@ -13,7 +13,6 @@ SIZE = (640, 360)
 
 
 def picture(count, side_px):
-    """White squares, as many in each quarter."""
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     for number in range(count):
         x, y = 20 + 24 * (number % 25), 20 + 40 * (number // 25)

@@ -23,7 +23,6 @@ class Blobs:
         self.runs = 0
 
     def input_size(self, image_size):
-        """Square."""
         return self.side, self.side
 
     def detect(self, image_bgr):
@@ -40,7 +39,6 @@ class Blobs:
 
 
 def picture(*boxes, size=(1280, 720), value=255):
-    """White blobs on black."""
     image = np.zeros((size[1], size[0], 3), np.uint8)
     for x1, y1, x2, y2 in boxes:
         image[y1:y2, x1:x2] = value

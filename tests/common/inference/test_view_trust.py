@@ -8,7 +8,6 @@ from rigs.examples import detections
 
 
 def many(*confidences):
-    """Detections of these confidences."""
     count = len(confidences)
     return detections(np.zeros((count, 4)), confidences)
 

@@ -29,7 +29,6 @@ def dated(gaps):
 
 
 def fed(items):
-    """A ledger that counted these events."""
     ledger = Ledger(window_ns=WINDOW, slack_ns=SLACK)
     for at, channel, payload, attachment in items:
         ledger.count(channel, payload_bytes=payload, attachment_bytes=attachment, overhead_bytes=66, at_ns=at)
@@ -37,7 +36,6 @@ def fed(items):
 
 
 def brute(items, channel, now):
-    """A window's line bytes, from the definition."""
     return sum(
         payload + attachment + 66
         for at, entry, payload, attachment in items

@@ -96,8 +96,6 @@ class Panic(BaseException):
 
 
 def raising(error):
-    """What raises it."""
-
     def run(_part):
         raise error
 

@@ -14,7 +14,6 @@ JSON = ("--log-format", "json")
 
 
 def lines(said):
-    """Each must be an object."""
     return [json.loads(line) for line in said.splitlines()]
 
 

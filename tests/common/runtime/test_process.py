@@ -196,7 +196,6 @@ def test_a_process_ends_with_its_code_while_a_detection_runs():
 
 
 def niceness(thread):
-    """Of a thread by its native id."""
     return os.getpriority(os.PRIO_PROCESS, thread)
 
 

@@ -14,7 +14,6 @@ latencies = st.lists(st.floats(0, 1e6, allow_nan=False), min_size=1, max_size=20
 
 
 def filled(values_ms):
-    """Stats of these latencies."""
     stats = LatencyStats()
     for value_ms in values_ms:
         stats.add(float(value_ms))

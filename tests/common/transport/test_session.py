@@ -42,17 +42,14 @@ WILD = ("tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/0.0.0.0:7447", "tcp/0.0.0.0:74
 
 @pytest.fixture
 def endpoint(free_port):
-    """A free endpoint on loopback."""
     return f"tcp/127.0.0.1:{free_port}"
 
 
 def ground(endpoint):
-    """The listening side."""
     return LinkSettings("ground", listen=(endpoint,))
 
 
 def edge(endpoint):
-    """The connecting side."""
     return LinkSettings("edge", connect=(endpoint,))
 
 

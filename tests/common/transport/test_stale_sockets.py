@@ -31,7 +31,6 @@ pytestmark = pytest.mark.skipif(not TCP_TABLES[0].exists(), reason="needs the ke
 
 
 def lingering():
-    """Descriptors of this process whose close may wait."""
     found = []
     for fd in (int(one.name) for one in Path("/proc/self/fd").iterdir()):
         try:

@@ -22,7 +22,6 @@ SIZE = (320, 192)
 
 @pytest.fixture(scope="module")
 def picture():
-    """As the decoder gives it."""
     image = textured(*SIZE, seed=2)
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=10, bitrate_bps=2_000_000))
     found = BaseDecoder().decode_yuv(encoder.encode(Frame(0, 0, image, image), keyframe=True).data)

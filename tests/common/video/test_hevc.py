@@ -18,7 +18,6 @@ SIZE = (320, 192)
 
 
 def coded(count, *, keyframes=(), size=SIZE):
-    """Access units of a small easy clip."""
     encoder = BaseEncoder(EncoderSettings(size=size, fps=15, bitrate_bps=300_000, preset="ultrafast"))
     return [
         encoder.encode(frame, keyframe=frame.index in keyframes).data

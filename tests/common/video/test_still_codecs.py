@@ -22,14 +22,12 @@ SIZE = (56, 40)
 
 @pytest.fixture(params=NAMES)
 def codec(request):
-    """Each codec that this machine has."""
     if request.param not in still_codec_names():
         pytest.skip(f"{request.param} is not installed")
     return still_codec(request.param)
 
 
 def encoded(codec, crop, quality_pct):
-    """With the base that it may want."""
     return codec.encode(crop, quality_pct=quality_pct, base_bgr=_base(codec, crop))
 
 

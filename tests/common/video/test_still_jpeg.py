@@ -14,12 +14,10 @@ CODEC = JpegCodec()
 
 
 def coded(crop, quality_pct=65):
-    """As JPEG."""
     return CODEC.encode(crop, quality_pct=quality_pct).data
 
 
 def pillow_jpeg(image_bgr, **options):
-    """The same picture as Pillow codes it."""
     buffer = io.BytesIO()
     Pillow.fromarray(image_bgr[..., ::-1].copy()).save(buffer, "JPEG", **options)
     return buffer.getvalue()

@@ -3,8 +3,6 @@
 Disk, model, viewer and link are lost in `lab.failures`, which the nightly run flies.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,28 +32,23 @@ class Watcher:
 
     @property
     def units(self) -> list[BaseHeader]:
-        """Headers of the access units that came."""
         return [BaseHeader.parse(one.attachment, one.payload) for one in self._base.messages]
 
     @property
     def status(self) -> Status:
-        """The newest."""
         return Status.parse(self._status.messages[-1].payload)
 
     def failed(self, name: str) -> FailedPart | None:
-        """What the newest status says of a part."""
         parts = self.status.failed if self._status.messages else ()
         return next((one for one in parts if one.part == name), None)
 
     def goes_on(self, *, frames: int = 15) -> None:
-        """So many more frames come."""
         before = len(self._base.messages)
         eventually(lambda: len(self._base.messages) >= before + frames, what="video goes on")
 
 
 @contextmanager
 def watched(link: Link, *settings: str) -> Iterator[tuple[Running, Watcher]]:
-    """An edge with these settings, and its watcher."""
     edge = link.edge("--wait", "0s", *SMALL, *settings, listens=True)
     with joined(link.edge_endpoint) as session:
         watcher = Watcher(session)

@@ -1,7 +1,5 @@
 """A flight in which an edge and the ground are killed with -9 and started again, while another edge flies on."""
 
-from __future__ import annotations
-
 import json
 import signal
 from dataclasses import dataclass
@@ -55,7 +53,6 @@ class Flight:
 
     @property
     def rows(self) -> dict[str, RecordingRow]:
-        """The index at the end, by file."""
         return {one.file: one for one in read_index(self.folder / "flights")}
 
     def before(self, *, doomed: bool) -> list[Path]:

@@ -1,7 +1,5 @@
 """A disk that fills while a ground writes there: only what is written there suffers."""
 
-from __future__ import annotations
-
 import csv
 import subprocess
 from collections.abc import Iterator
@@ -37,7 +35,6 @@ def edges(link: Link, scene: Path) -> list[Running]:
 
 
 def columns(path: Path, name: str) -> list[str]:
-    """A column of a table."""
     with path.open(newline="") as file:
         return [row[name] for row in csv.DictReader(file)]
 

@@ -1,7 +1,5 @@
 """What is not there yet is waited for, with a sentence, while everything else runs: an address, a port, a device."""
 
-from __future__ import annotations
-
 import os
 import pty
 import socket
@@ -57,13 +55,11 @@ class Holder:
         self.port = int(self._process.stdout.readline())
 
     def let_go(self) -> None:
-        """The port is free."""
         self._process.communicate("")
 
 
 @contextmanager
 def metrics(holder: Holder, failures: Failures) -> Iterator[Callable[[], bool]]:
-    """Of either program."""
     found = {"/": lambda: Answer(b"ok")}
     with HealthServer(f"127.0.0.1:{holder.port}", found, failures=failures):
         yield lambda: answers(holder.port)
@@ -71,14 +67,12 @@ def metrics(holder: Holder, failures: Failures) -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def web(holder: Holder, failures: Failures) -> Iterator[Callable[[], bool]]:
-    """The page."""
     with WebPage(f"127.0.0.1:{holder.port}", clock=time.time_ns, failures=failures):
         yield lambda: answers(holder.port)
 
 
 @contextmanager
 def listener(holder: Holder, failures: Failures, protocol: str = "tcp") -> Iterator[Callable[[], bool]]:
-    """Of the link."""
     settings = LinkSettings(role="ground", listen=(f"{protocol}/127.0.0.1:{holder.port}",))
     other = LinkSettings(role="edge", connect=settings.listen)
     with open_session(settings, failures=failures) as session, open_session(other):
@@ -188,22 +182,18 @@ class Silent(Grabber):
         """There is nothing to close."""
 
     def grab(self) -> Shot:
-        """Nothing."""
         raise SignalLost("no frame")
 
 
 def read_settings(path: str) -> object:
-    """As of a command line."""
     return load(EdgeConfig, ("--config", path), program="hvt-edge", description="")
 
 
 def in_flight(source: str) -> object:
-    """As for a flight."""
     return World().open_source(EdgeConfig(source=source))
 
 
 def read_keys(path: str) -> object:
-    """As for a link."""
     return configure(LinkSettings("edge", zenoh_config=Path(path)))
 
 

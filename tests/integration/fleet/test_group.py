@@ -1,7 +1,5 @@
 """Six edges and three grounds behind a router, each in a network of its own: router, ground and link go in turn."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -31,7 +29,6 @@ _STATE = "import sys, urllib.request as r; sys.stdout.buffer.write(r.urlopen('ht
 
 @pytest.fixture(autouse=True)
 def pictures(long_scene: Path, tmp_path: Path) -> None:
-    """Minutes of it, where the edges run."""
     (tmp_path / "pictures").symlink_to(long_scene)
 
 
@@ -110,7 +107,6 @@ class Fleet:
         return time.monotonic() - began_s
 
     def close(self) -> None:
-        """Leave no process behind."""
         for one in (*self.edges.values(), *self.grounds.values()):
             if one.alive:
                 one.kill()

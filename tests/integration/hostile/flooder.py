@@ -5,8 +5,6 @@
 It listens to the edge first, so that what it says is of the session that runs. Prints how much it said.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
@@ -38,7 +36,6 @@ Said = tuple[Channel, bytes, bytes | None]
 
 
 def copies(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
-    """Everything that was heard, over and over."""
     rows = [row for row in (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.STATUS) if heard[row]]
     for number in count():
         row = rows[number % len(rows)]
@@ -62,7 +59,6 @@ def ahead(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
 
 
 def statuses(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
-    """Reports and tracks with numbers from far ahead."""
     status = Status.parse(heard[Channel.STATUS][-1].payload)
     steps = [TrackStep.parse(one.payload) for one in heard[Channel.TRACKS][-1:]]
     for number in count(1):
@@ -120,7 +116,6 @@ NEEDED = {
 
 
 def main() -> None:
-    """Listen, then speak."""
     parser = argparse.ArgumentParser()
     parser.add_argument("kind", choices=[*KINDS, "questions"])
     parser.add_argument("--hear", required=True)
@@ -142,7 +137,6 @@ def main() -> None:
 def listened(
     session: zenoh.Session, keys: EdgeKeys, needed: tuple[Channel, ...]
 ) -> dict[Channel, list[Message]]:
-    """Some of each row, by row."""
     tap, end_s = Tap(session, f"hvt/{keys.edge}/**"), time.monotonic() + 40
     while time.monotonic() < end_s:
         heard: dict[Channel, list[Message]] = {row: [] for row in Channel}
@@ -157,7 +151,6 @@ def listened(
 def say(
     kind: str, heard: dict[Channel, list[Message]], session: zenoh.Session, keys: EdgeKeys, *, seconds: float
 ) -> dict[str, float]:
-    """As fast as the link takes it."""
     end_s, said, size_bytes = time.monotonic() + seconds, 0, 0
     for row, payload, attachment in KINDS[kind](heard):
         session.put(

@@ -1,7 +1,5 @@
 """One flight over TLS: stills on demand through its ground, what those without the right are told, the account."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ It speaks in the edge's own session, or in the ground's own name: no checksum an
 be shown while somebody else counts on in the edge's name; it has to come back, and nothing may grow.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -13,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import psutil
 import pytest
@@ -44,7 +42,6 @@ class Growth:
         self._first = self._process.memory_info().rss
 
     def __call__(self) -> float:
-        """Megabytes."""
         return (self._process.memory_info().rss - self._first) / 2**20
 
 
@@ -62,10 +59,9 @@ class Flight:
 
     @property
     def growth_mb(self) -> float:
-        """How far either may have grown by now."""
         return _GROWTH_MB + _GROWTH_SHARE * sum(one.get("bytes", 0) for one in self.said.values()) / 2**20
 
-    def flooded(self, kind: str) -> Flight:
+    def flooded(self, kind: str) -> Self:
         """With this flood over, whoever of the tests is the first to need it."""
         if kind not in self.said:
             self._flood(kind)
@@ -99,7 +95,6 @@ class Flight:
 
     @property
     def newest_frame(self) -> int:
-        """What the edge itself sent last."""
         message = self.base.messages[-1]
         return BaseHeader.parse(message.attachment, message.payload).frame_index
 
@@ -120,7 +115,6 @@ class Flight:
 
 @pytest.fixture(scope="module")
 def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
-    """Until the picture is there."""
     folder = tmp_path_factory.mktemp("flood")
     with Link(folder) as link:
         ground = link.ground("--record", "flight.rrd", "--detector", "motion", "--classifier", "none")

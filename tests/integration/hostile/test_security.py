@@ -1,7 +1,5 @@
 """Who gets in over real TLS, who may do what, and what each who may not is told."""
 
-from __future__ import annotations
-
 import logging
 import re
 import time

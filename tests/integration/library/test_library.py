@@ -1,7 +1,5 @@
 """HVT as a part of another program: frames are pushed in at one end, pictures and tracks come out at the other."""
 
-from __future__ import annotations
-
 import queue
 import subprocess
 import sys
@@ -40,7 +38,6 @@ def push_all(edge: PushedEdge, frames: list[np.ndarray], *, rounds: int = 1) -> 
 
 
 def push_until(edge: PushedEdge, frames: list[np.ndarray], times: list[int], enough: threading.Event) -> None:
-    """The frames over and over."""
     while not enough.wait(1 / FPS):
         times.append(time.time_ns())
         edge.push(frames[(len(times) - 1) % len(frames)], capture_ns=times[-1])

@@ -1,7 +1,5 @@
 """The programs of docs/library.md, as a reader copies them."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The page in a real browser, on a real flight: what an operator sees and can do."""
 
-from __future__ import annotations
-
 import re
 import signal
 import time
@@ -35,7 +33,6 @@ class Flight:
     browser: Any
 
     def page(self, fragment: str = "", **more) -> Any:
-        """Another viewer, with nothing kept from the others."""
         page = self.browser.new_context(**more).new_page()
         page.set_default_timeout(1000 * PATIENT_S)
         page.goto(f"{self.address}#{fragment}")
@@ -81,7 +78,6 @@ def frame(page: Any) -> int:
 
 
 def shows(page: Any, *, after: int = -1) -> int:
-    """Wait until it shows a later frame."""
     eventually(lambda: frame(page) > after, what="a picture is shown")
     return frame(page)
 

@@ -1,7 +1,5 @@
 """Two edges on one page in a real browser: nothing of one is ever shown as the other's."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time

@@ -1,7 +1,5 @@
 """A camera that makes HEVC itself, through edge, Zenoh and ground: what is recorded is what it made."""
 
-from __future__ import annotations
-
 import pytest
 
 import hvt_edge.cli
@@ -22,12 +20,10 @@ def camera(clip: object) -> tuple[str, ...]:
 
 
 def with_camera(link: Link, clip: object, *settings: str) -> Running:
-    """Such an edge, started."""
     return link.edge(*camera(clip), *settings)
 
 
 def ground_of(link: Link) -> Running:
-    """A ground that records."""
     return link.ground("--once", "--record", "flight.rrd", "--classifier", "none", "--detector", "motion")
 
 

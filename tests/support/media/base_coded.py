@@ -18,13 +18,11 @@ class StandIn:
     needs_base: bool = field(default=True, init=False)
 
     def encode(self, crop_bgr, *, quality_pct, base_bgr=None) -> CodedCrop:
-        """The difference, halved to fit a byte."""
         half = (np.round((crop_bgr.astype(np.float32) - base_bgr) / 2) + 128).clip(0, 255).astype(np.uint8)
         data = cv2.imencode(".webp", half, [cv2.IMWRITE_WEBP_QUALITY, quality_pct])[1].tobytes()
         return CodedCrop(data, {"c": zlib.crc32(base_bgr.tobytes())})
 
     def decode(self, data, *, size, parameters=NO_PARAMETERS, base_bgr=None):
-        """The base with the difference put back."""
         if base_bgr is None or zlib.crc32(base_bgr.tobytes()) != parameters["c"]:
             raise BaseMissingError("another base")
         half = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -38,9 +36,7 @@ class Hopeless:
     name, media_type, needs_base = "hopeless", "image/png", False
 
     def encode(self, crop_bgr, *, quality_pct, base_bgr=None) -> CodedCrop:
-        """All of it."""
         return CodedCrop(crop_bgr.tobytes())
 
     def decode(self, data, *, size, parameters=NO_PARAMETERS, base_bgr=None):
-        """The same."""
         return np.frombuffer(data, np.uint8).reshape(size[1], size[0], 3)

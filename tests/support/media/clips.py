@@ -12,7 +12,6 @@ START_NS = 1_790_000_000_000_000_000
 
 
 def framed(pictures: list[np.ndarray], *, fps: float = 15.0) -> list[Frame]:
-    """As a source would hand them on."""
     return [
         Frame(index, START_NS + round(index * 1e9 / fps), picture, picture)
         for index, picture in enumerate(pictures)

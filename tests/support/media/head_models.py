@@ -39,17 +39,14 @@ class Graph:
         self.weights: list[onnx.TensorProto] = []
 
     def const(self, value: object, dtype: type = np.float32) -> _Tensor:
-        """A constant."""
         name = f"c{len(self.weights)}"
         self.weights.append(numpy_helper.from_array(np.array(value, dtype), name))
         return name
 
     def ints(self, *values: int) -> _Tensor:
-        """A constant list of whole numbers."""
         return self.const(values, np.int64)
 
     def op(self, kind: str, *inputs: _Tensor, **attributes: object) -> _Tensor:
-        """A node with one output."""
         name = f"t{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
         return name
@@ -59,7 +56,6 @@ class Graph:
         return self.op("Slice", table, self.ints(first), self.ints(last), self.ints(1))
 
     def batch(self, tensor: _Tensor) -> _Tensor:
-        """With a first axis of one."""
         return self.op("Unsqueeze", tensor, self.ints(0))
 
     def find(self, image: _Tensor, *, bgr: bool = False, top: float = 1.0) -> tuple[_Tensor, _Tensor]:
@@ -115,7 +111,6 @@ class Graph:
         return self.op("Reshape", scores, self.ints(_KINDS, 1))
 
     def padded(self, table: _Tensor, rows: np.ndarray) -> _Tensor:
-        """With further rows."""
         return self.op("Concat", table, self.const(rows), axis=0)
 
 
@@ -231,7 +226,6 @@ def _yolo_nas(graph: Graph, image: _Tensor) -> _Outputs:
 
 
 def _nms_lists(graph: Graph, image: _Tensor) -> _Outputs:
-    """Behind the count stand rows that are none."""
     boxes, scores = graph.find(image)
     junk = np.array([[5.0, 5, 90, 90]] * 8)
     return {

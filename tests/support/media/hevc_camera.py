@@ -45,7 +45,6 @@ def write_clip(
 
 
 def packets_of(path: Path) -> list[bytes]:
-    """What the container holds, as it is there."""
     with av.open(str(path)) as container:
         return [bytes(packet) for packet in container.demux(video=0) if packet.size]
 

@@ -30,12 +30,10 @@ class Target:
     items: dict[int, bytes]
 
     def number(self, tag: int) -> int:
-        """Of an unsigned item."""
         return int.from_bytes(self.items[tag])
 
     @property
     def class_name(self) -> str:
-        """Of its VObject."""
         return dict(KLVParser(self.items[102], 1))[b"\x02"].decode()
 
 

@@ -42,7 +42,6 @@ def disc(picture: np.ndarray) -> tuple[int, int]:
 
 
 def patch(picture: np.ndarray, *, right: bool, bottom: bool = False) -> tuple[int, ...]:
-    """The mean colour, BGR, in a corner."""
     high, wide = picture.shape[:2]
     rows = slice(-high // 6, -high // 8) if bottom else slice(high // 16, high // 8)
     columns = slice(-wide // 8, -wide // 16) if right else slice(wide // 16, wide // 8)

@@ -1,12 +1,10 @@
 """A fleet's keys for tests, made by the command that users run, with copies that have one fault each."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import shutil
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import json5
 
@@ -31,7 +29,6 @@ class Fleet:
         run([command, name, "--dir", str(self.folder), *where, *arguments])
 
     def file(self, name: str) -> Path:
-        """The Zenoh configuration of a machine."""
         return self.folder / f"{name}.json5"
 
     def settings(
@@ -42,20 +39,18 @@ class Fleet:
         listen: tuple[str, ...] = (),
         connect: tuple[str, ...] = (),
     ) -> LinkSettings:
-        """How this machine takes part."""
         return LinkSettings(role, listen, connect, self.file(name), name=name if role == "edge" else None)
 
-    def copy(self, folder: Path) -> Fleet:
+    def copy(self, folder: Path) -> Self:
         """The same fleet in another folder, with files that name the keys there."""
         shutil.copytree(self.folder, folder)
         for file in folder.glob("*.json5"):
             file.write_text(file.read_text().replace(str(self.folder), str(folder)))
-        other = object.__new__(Fleet)
+        other = object.__new__(type(self))
         other.folder = folder
         return other
 
     def reissue(self, name: str, *hosts: str, now: dt.datetime | None = None) -> None:
-        """Another pair of that name."""
         Authority.open(self.folder).issue(name, hosts=hosts, now=now)
 
     def changed(self, name: str, **tls: Any) -> Path:

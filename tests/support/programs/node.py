@@ -14,7 +14,6 @@ needs_node = pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt in
 
 
 def ran(script: str) -> Any:
-    """What a module of JavaScript prints as JSON."""
     done = subprocess.run(
         [str(NODE), "--input-type=module", "-e", script],
         capture_output=True,

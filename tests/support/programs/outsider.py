@@ -51,7 +51,6 @@ class Tap:
 
     @property
     def messages(self) -> list[Message]:
-        """All so far."""
         with self._lock:
             return list(self._messages)
 

@@ -89,7 +89,6 @@ def router(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def answers(port: int) -> bool:
-    """Whether a TCP server is there on loopback."""
     with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
         return True
     return False
@@ -147,7 +146,6 @@ class Running:
 
     @property
     def said(self) -> str:
-        """Standard error so far: status lines and warnings."""
         return self._err.read_text(errors="replace")
 
     @property
@@ -157,7 +155,6 @@ class Running:
 
     @property
     def alive(self) -> bool:
-        """Whether it still runs."""
         return self.process.poll() is None
 
     def until(self, text: str) -> float:
@@ -252,7 +249,6 @@ class Link:
 
     @property
     def ground_endpoint(self) -> str:
-        """Where a ground of this link listens."""
         return f"tcp/127.0.0.1:{self.port}"
 
     @property

@@ -38,19 +38,16 @@ class ReadBox:
 
 
 def settings(path: Path | None, **changes: Any) -> RecorderSettings:
-    """Of a small recording."""
     small = RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0, {"method": "M5"})
     return replace(small, **changes)
 
 
 def settings_of(info: Info, path: Path, **changes: Any) -> RecorderSettings:
-    """As a ground makes them for a session."""
     session = f"{info.session_id:08x}"
     return RecorderSettings(path, info.edge, session, info.base_size, info.fps, info.budget_bps, **changes)
 
 
 def recorded(path: Path, events: Iterable[Event], **changes: Any) -> Path:
-    """A recording of these."""
     with Recorder(settings(path, **changes)) as recorder:
         for event in events:
             recorder.log(event)

@@ -78,7 +78,6 @@ class RtspCamera:
                     self._talk(viewer)
 
     def _talk(self, viewer: socket.socket) -> None:
-        """Answer until PLAY, then send pictures."""
         pending = b""
         while not self._stop.is_set():
             with contextlib.suppress(TimeoutError):

@@ -28,7 +28,6 @@ class SilentTunnel:
         """Connections that were accepted in darkness."""
 
     def darken(self) -> None:
-        """The line falls dark."""
         self._dark.set()
 
     def lighten(self) -> None:

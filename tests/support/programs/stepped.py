@@ -12,7 +12,6 @@ from pathlib import Path
 
 
 def run(module: str, step_s: float) -> int:
-    """The program's exit code."""
     wall_ns, flag = time.time_ns, Path("step").resolve()
     stepped = False
 

@@ -24,20 +24,17 @@ def still_object(flight: Flight, index: int, sequence: int, **changes) -> bytes:
 
 
 def video_object(flight: Flight, indices: Sequence[int]) -> bytes:
-    """A stretch of the base stream."""
     units = [flight.units[index] for index in indices]
     return pack_backlog_units([BacklogUnit(u.frame_index, u.capture_ns, u.keyframe, u.data) for u in units])
 
 
 def info_object(flight: Flight) -> bytes:
-    """The facts of the session."""
     return flight.info().pack()
 
 
 def chunks(
     session_id: int, kind: str, number: int, data: bytes, *, chunk_bytes: int = 1400
 ) -> list[Received]:
-    """The object in chunks, in order."""
     items = []
     for offset in range(0, len(data), chunk_bytes):
         payload = data[offset : offset + chunk_bytes]

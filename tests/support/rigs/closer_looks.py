@@ -51,13 +51,11 @@ class RequestedLook:
 
     @property
     def delay_s(self) -> float:
-        """From the request until it goes out."""
         assert self.header is not None, self.refusal
         return (self.header.send_ns - self.asked_ns) / 1e9
 
     @property
     def psnr_db(self) -> tuple[float, float]:
-        """Of the still and of the base, luma."""
         assert self.image is not None
         assert self.source is not None
         assert self.base is not None
@@ -88,13 +86,11 @@ class LookFlight(World):
     # The world
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """The source, with requests between its frames."""
         inner = super().open_source(config) if self.open is None else self.open(config)
         self.view = inner.view
         return PassedOn(inner, before=self.before)
 
     def open_link(self, stack: Any, config: EdgeConfig) -> Any:
-        """This is the link too."""
         del stack, config
         return self
 
@@ -103,11 +99,9 @@ class LookFlight(World):
     unusable, trouble = 0, ""
 
     def has_ground(self) -> bool:
-        """Nobody answers."""
         return False
 
     def has_subscriber(self, channel: Channel) -> bool:
-        """Somebody takes all."""
         del channel
         return True
 
@@ -115,7 +109,6 @@ class LookFlight(World):
         """It loses nothing."""
 
     def listen(self, answers: Answers) -> None:
-        """The edge is ready."""
         self._control = answers.control
         self.info = Info.parse(answers.info(START_NS))
 
@@ -137,7 +130,6 @@ class LookFlight(World):
     # Requests
 
     def command(self, command: str, **arguments: Any) -> ControlAnswer:
-        """As of a ground."""
         assert self._control is not None
         return self._control(ControlRequest(session_id=0, command=command, arguments=arguments))
 
@@ -173,7 +165,6 @@ class LookFlight(World):
                 )
 
     def run(self) -> dict[str, Any]:
-        """Fly; return the summary."""
         config = EdgeConfig(pace="lockstep", edge_id="uav-1", quiet=True, wait=0.0, **self.settings)
         config = check(with_profile(config, given=set(self.settings)))
         return Edge(config, stop=threading.Event(), world=self).run()

@@ -92,11 +92,9 @@ class Rig:
 
     @property
     def now_ns(self) -> int:
-        """Time of the newest frame."""
         return START_NS + max(0, self.index) * FRAME_NS
 
     def box(self, index: int) -> tuple[float, float, float, float]:
-        """Where the car is, base pixels."""
         return 20.0 + 3 * index, 100.0, 80.0 + 3 * index, 140.0
 
     def run(self, frames: int, *, others: bool = False) -> None:
@@ -132,5 +130,4 @@ class Rig:
         return ControlAnswer.parse(answer.pack())
 
     def asked(self) -> list[tuple[RoiHeader, bytes]]:
-        """Those of the stills that were asked for."""
         return [(header, data) for header, data in self.out.stills if header.reason == "asked"]

@@ -43,7 +43,6 @@ class DrawnFlight:
     ground: dict[str, Any]
 
     def tracks(self) -> list[dict[str, str]]:
-        """The rows of the tracks table."""
         with (self.folder / "flight.csv").open(encoding="utf-8") as file:
             return list(csv.DictReader(file))
 
@@ -98,7 +97,6 @@ def fly(link: Link, *ground: str, edge: tuple[str, ...] = ()) -> tuple[dict[str,
 
 
 def fly_into_all_sinks(folder: Path) -> DrawnFlight:
-    """In lockstep, with the scene's own pose."""
     (port,) = free_ports(1)
     (folder / "types.toml").write_text('[classes]\nbus = "a-n-G-E-V-C"\n', encoding="utf-8")
     (folder / "stills").mkdir()

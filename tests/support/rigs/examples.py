@@ -22,7 +22,6 @@ class Clock:
         self.now_ns = now_ns
 
     def __call__(self) -> int:
-        """Now."""
         return self.now_ns
 
 

@@ -85,7 +85,6 @@ class RedSquares:
         self.takes_s = takes_s
 
     def detect(self, image_bgr: Image) -> Detections:
-        """One car, or nothing."""
         time.sleep(self.takes_s)
         low, high = np.array([0, 0, 170], np.uint8), np.array([110, 130, 255], np.uint8)
         ys, xs = np.nonzero(cv2.inRange(image_bgr, low, high))
@@ -104,7 +103,6 @@ class NothingSeen:
         self.runs = 0
 
     def detect(self, _image_bgr: Image) -> Detections:
-        """Nothing."""
         self.runs += 1
         return Detections.none()
 
@@ -124,7 +122,6 @@ class SameAnswer:
     """Where it sees every object."""
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:
-        """The same for each."""
         self.had_base += [base_bgr is not None] * len(stills)
         probabilities = np.array([1 - self.confidence, self.confidence], np.float32)
         answer = Posterior(self.class_names[1], self.confidence, 0.3, probabilities)
@@ -136,7 +133,6 @@ class DetectsAtOnce(DetectorThread):
     """In the thread that asks, so that no list goes out without what its picture shows, however busy the machine."""
 
     def submit(self, picture: Picture, detect: Callable[[Picture], Detections]) -> Detection:
-        """Search it."""
         detection = Detection(picture, detect)
         detection.run()
         return detection
@@ -229,7 +225,6 @@ class Flight:
         self._steps = TrackStepEncoder(session_id=self.session_id)
 
     def info(self) -> Info:
-        """What the edge answers."""
         now = time.time_ns()
         return replace(
             messages.INFO,
@@ -248,7 +243,6 @@ class Flight:
         )
 
     def base(self, index: int) -> Received:
-        """The access unit of a frame."""
         unit = self.units[index]
         header = BaseHeader(
             session_id=self.session_id,
@@ -292,7 +286,6 @@ class Flight:
     def status(
         self, *, base: int, roi: int = 0, backlog: int = 0, state: str = "running", meta: int = 0
     ) -> Received:
-        """The edge's report after so many messages."""
         self._statuses += 1
         counts: dict[str, Any] = dict.fromkeys(
             ("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"), 0
@@ -320,7 +313,6 @@ class Flight:
 
 
 def line_bytes(items: Iterable[Received]) -> int:
-    """What all of them take on the line."""
     return sum(
         one.size_bytes
         + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
@@ -360,7 +352,6 @@ class Port:
         return self.flight.info(), now, time.time_ns()
 
     def request_keyframe(self) -> None:
-        """Counts."""
         self.keyframe_requests += 1
 
     def report(self, feedback: Feedback) -> None:
@@ -368,15 +359,12 @@ class Port:
         self.reports.append(Feedback.parse(feedback.pack()))
 
     def request_info(self, session_id: int) -> None:
-        """Notes it."""
         self.clock_requests.append(session_id)
 
     def take_info(self) -> tuple[Info, int, int] | None:
-        """The answer, as if it had just come."""
         return self.query_info(self.clock_requests.pop()) if self.clock_requests else None
 
     def raise_error(self) -> None:
-        """What went wrong in a callback."""
         broken, self.broken = self.broken, None
         if broken is not None:
             raise broken

@@ -30,13 +30,11 @@ class WatchedInbox(Inbox):
         return self._handled
 
     def put(self, item: Received) -> None:
-        """As any inbox does."""
         with self._watch:
             super().put(item)
             self._handled = False
 
     def get(self, *, timeout_s: float) -> Received | None:
-        """As any inbox does."""
         with self._watch:
             self._handled |= len(self) == 0
         return super().get(timeout_s=timeout_s)
@@ -60,11 +58,9 @@ class ReceiverRig:
         self.receiver.start(drain_s=PATIENT_S)
 
     def sinks_of(self, _info: Info) -> Sequence[Sink]:
-        """What a session is given out to."""
         return ()
 
     def backlog_perception(self, _info: Info) -> SessionPerception | None:
-        """Who looks at what was stored."""
         return None
 
     def _open(self, info: Info, reports: ReceiverReports) -> Session:
@@ -81,7 +77,6 @@ class ReceiverRig:
         return session
 
     def put(self, *items: Received) -> None:
-        """What Zenoh's callback does."""
         for item in items:
             self.inbox.put(item)
 
@@ -104,7 +99,6 @@ class ReceiverRig:
 
     @property
     def session(self) -> Session:
-        """The one that is open."""
         assert self.receiver.session is not None
         return self.receiver.session
 

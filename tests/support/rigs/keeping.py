@@ -63,7 +63,6 @@ class Ground:
         self.assembly = BacklogAssembly()
 
     def take(self, row: Channel, payload: bytes, attachment: bytes) -> None:
-        """A message arrives."""
         if row is Channel.BASE:
             base = BaseHeader.parse(attachment, payload)
             self.base_sequence = max(self.base_sequence, base.sequence)
@@ -88,7 +87,6 @@ class Ground:
             self.backlog_stills.add(RoiHeader.parse(still.attachment, still.payload).sequence)
 
     def report(self, now_ns: int) -> Feedback:
-        """What it says now."""
         self.number += 1
         missing = [one for one in range(self.still_sequence) if one not in self.stills]
         return feedback(
@@ -113,7 +111,6 @@ class Out:
         self.before_put: Callable[[Channel], None] = lambda _row: None
 
     def put(self, row, payload, *, attachment=None, encoding="") -> None:
-        """Keep it, and let it arrive."""
         self.before_put(row)
         self.puts.append((row, payload, attachment or b""))
         if not self.dark:
@@ -121,12 +118,10 @@ class Out:
 
     @property
     def base(self) -> list[BaseHeader]:
-        """Headers of the base stream."""
         return [BaseHeader.parse(extra, data) for row, data, extra in list(self.puts) if row is Channel.BASE]
 
     @property
     def backlog(self) -> list[tuple[BacklogHeader, bytes]]:
-        """Pieces of what was kept."""
         return [
             (BacklogHeader.parse(extra, data), data)
             for row, data, extra in list(self.puts)
@@ -233,7 +228,6 @@ class Rig:
                 self.report()
 
     def base(self, frame: Frame) -> AccessUnit | None:
-        """The base stage for one frame."""
         decision = self.stage.decide(frame, now_ns=self.now_ns)
         unit = self.stage.encode(frame, decision, now_ns=self.now_ns)
         if unit is not None:
@@ -254,7 +248,6 @@ class Rig:
             self.link_control.on_feedback(self.out.ground.report(self.now_ns))
 
     def still(self, sequence: int, *, utility: float = 1.0) -> None:
-        """One goes out."""
         one = _pending(utility, self.now_ns)
         self.outbox.sent(one, STILL.with_header(sequence=sequence), now_ns=self.now_ns)
         self.stills.put(one, now_ns=self.now_ns, store=False)
@@ -266,7 +259,6 @@ class Rig:
         self.stills.put(one, now_ns=self.now_ns, store=True)
 
     def close(self) -> None:
-        """The run ends."""
         self.stills.close(self.now_ns)
         self.backlog.close()
 
@@ -290,7 +282,6 @@ class Rig:
         return notes
 
     def kept(self) -> list:
-        """What another start of the edge finds."""
         self.close()
         now_s = (self.now_ns - START_NS) / S
         with opened(self.path, session_id=8, at_s=(now_s, now_s)) as folder:
@@ -309,5 +300,4 @@ class Rig:
 
 
 def _pending(utility: float, now_ns: int) -> OutboxStill:
-    """A still about to be coded."""
     return OutboxStill(PENDING, None, utility, now_ns)

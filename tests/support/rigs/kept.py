@@ -51,7 +51,6 @@ def opened(
 
 
 def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int = 7) -> bytes:
-    """A still as it is kept."""
     header = replace(
         PLAIN,
         session_id=session_id,
@@ -67,20 +66,17 @@ def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int =
 
 
 def add_stills(folder: Store, utilities: dict[int, float], *, capture_ns: int = START_NS) -> None:
-    """One of each number."""
     for number, utility in utilities.items():
         folder.add_still(number, packed_still(number), utility=utility, capture_ns=capture_ns)
 
 
 def add_units(folder: Store, units: list[AccessUnit]) -> None:
-    """A run, ended."""
     for unit in units:
         folder.add_unit(unit)
     folder.end_segment()
 
 
 def shifted(unit: AccessUnit, seconds: int) -> AccessUnit:
-    """The same picture some seconds later."""
     return AccessUnit(
         unit.frame_index + 15 * seconds, unit.capture_ns + seconds * S, unit.data, unit.keyframe
     )

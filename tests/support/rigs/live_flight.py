@@ -5,15 +5,13 @@ frame decimation, base stage and link control. Simulated are the link, the groun
 (its sizes).
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -58,7 +56,6 @@ class SteppedLink:
     _free_ns: int = 0
 
     def bps(self, second: float) -> float:
-        """What it carries at this second."""
         at_ns = round(second * SECOND_NS)
         return next(rate for begin, rate in reversed(self.steps) if at_ns >= round(begin * SECOND_NS))
 
@@ -91,7 +88,6 @@ class _Encoder:
     mean_qp: float = 35.0
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Any] = ()) -> AccessUnit:
-        """A unit without content."""
         del regions
         mean = self.bitrate_bps / 8 / self.fps
         if keyframe:
@@ -121,7 +117,6 @@ class _Ground:
     asked_ns: int = -(10**18)
 
     def take(self, header: BaseHeader, *, now_ns: int) -> None:
-        """An access unit arrives."""
         if header.sequence <= self.last:
             return
         gap = header.sequence - self.last - 1
@@ -248,7 +243,6 @@ class LiveFlight:
 
     @property
     def second(self) -> float:
-        """Since the first frame."""
         return (self.now_ns - _START_NS) / SECOND_NS
 
     def _clock(self) -> int:
@@ -274,7 +268,6 @@ class LiveFlight:
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
-        """The link takes a message."""
         del encoding
         if self.second < self.joins_s:
             return
@@ -315,8 +308,7 @@ class LiveFlight:
 
         self._at(_START_NS + first_ns, lambda: turn(_START_NS + first_ns))
 
-    def fly(self, seconds: float) -> LiveFlight:
-        """So many seconds of it; once."""
+    def fly(self, seconds: float) -> Self:
         sender = self.transmitter
         if self.track_bytes:
             self._each(

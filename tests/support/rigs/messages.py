@@ -80,7 +80,6 @@ PLAIN = replace(
 
 
 def still_of(data: bytes = b"", *, media_type: str = "image/jpeg", **header: Any) -> Still:
-    """A coded still of the edge."""
     return Still(replace(PLAIN, **header), media_type, data=data)
 
 

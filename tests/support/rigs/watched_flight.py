@@ -1,7 +1,5 @@
 """One flight with ``--metrics`` and a log of JSON on both sides: flown once, read by several tests."""
 
-from __future__ import annotations
-
 import json
 import re
 import urllib.error
@@ -10,7 +8,7 @@ from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
@@ -45,7 +43,6 @@ def metrics(address: str) -> str:
 
 
 def state(address: str) -> dict[str, Any]:
-    """The newest; empty while there is none."""
     code, text = asked(address, "/state.json")
     found: dict[str, Any] = json.loads(text) if code == 200 else {}
     return found
@@ -91,8 +88,7 @@ class Told:
     readyz: tuple[int, str]
 
     @classmethod
-    def by(cls, address: str) -> Told:
-        """All of it."""
+    def by(cls, address: str) -> Self:
         return cls(state(address), metrics(address), asked(address, "/healthz"), asked(address, "/readyz"))
 
 

@@ -44,22 +44,18 @@ class Puts:
     def put(
         self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
-        """Keep it."""
         self.puts.append((row, payload, attachment or b"", encoding))
 
     @property
     def base(self) -> list[BaseHeader]:
-        """Headers of the base stream."""
         return [BaseHeader.parse(extra, data) for row, data, extra, _ in self.puts if row is Channel.BASE]
 
     @property
     def units(self) -> list[bytes]:
-        """Its access units."""
         return [data for row, data, _, _ in self.puts if row is Channel.BASE]
 
     @property
     def stills(self) -> list[tuple[RoiHeader, bytes]]:
-        """Headers and bytes."""
         return [
             (RoiHeader.parse(extra, data), data) for row, data, extra, _ in self.puts if row is Channel.ROI
         ]
@@ -123,7 +119,6 @@ def make_base_stage(encoder: Any, transmitter: Transmitter, **parts: Any) -> Bas
 
 
 def make_operating(config: EdgeConfig, *, decimation: int = 1) -> Operating:
-    """As a flight with these settings begins."""
     return Operating(
         budget_bps=config.budget_bps,
         video_share=config.fixed_share,
@@ -136,7 +131,6 @@ def make_operating(config: EdgeConfig, *, decimation: int = 1) -> Operating:
 def make_reconfiguration(
     operating: Operating, config: EdgeConfig, size: tuple[int, int], transmitter: Transmitter, **parts: Any
 ) -> EncoderReconfiguration:
-    """Of a real encoder, with fixed shares."""
     plain = {"open_encoder": partial(make_encoder, config, size=size), "split": None, "pacer": None}
     return reconfiguration_of(config, operating, size, budget=transmitter.budget, **(plain | parts))
 

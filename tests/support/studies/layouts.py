@@ -15,7 +15,6 @@ def square_xywh(index: int) -> tuple[int, int, int, int]:
 
 
 def write_images(folder: Path, count: int, *, name: str = "{:07d}.png", first: int = 1) -> None:
-    """Numbered pictures, lossless."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, picture in enumerate(smooth_pictures(count, size=SIZE), start=first):
         assert cv2.imwrite(str(folder / name.format(number)), picture)

@@ -199,7 +199,6 @@ PORT = helper.make_tensor_value_info
 
 
 def written(path, nodes, inputs, outputs, initialisers=()):
-    """A model file that nobody has checked."""
     graph = helper.make_graph(nodes, "prepared", inputs, outputs, list(initialisers))
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
     path.write_bytes(model.SerializeToString())
@@ -207,7 +206,6 @@ def written(path, nodes, inputs, outputs, initialisers=()):
 
 
 def same(path, *, inputs=1, outputs=1, shape=(1, 3, 8, 8)):
-    """A model that gives back what it gets."""
     ins = [PORT(f"x{n}", TensorProto.FLOAT, shape) for n in range(inputs)]
     outs = [PORT(f"y{n}", TensorProto.FLOAT, shape) for n in range(outputs)]
     nodes = [helper.make_node("Identity", [f"x{n % inputs}"], [f"y{n}"]) for n in range(max(inputs, outputs))]
@@ -217,7 +215,6 @@ def same(path, *, inputs=1, outputs=1, shape=(1, 3, 8, 8)):
 
 
 def sentence(path):
-    """Why it is refused."""
     with pytest.raises(UserError) as caught:
         open_model(path, settings=ONE_THREAD)
     said = str(caught.value)

@@ -29,13 +29,11 @@ GOOD = "Detections(np.array([[-5, 2, 900, 9], [3, 3, 8, 8]], 'f4'), np.array([0.
 
 @pytest.fixture
 def installed(packages):
-    """Installs a package with detectors."""
     return partial(packages, group="hvt.detectors")
 
 
 @pytest.fixture
 def blobs(installed):
-    """The detector of the example is installed."""
     installed({"acme-blobs": "BlobDetector"}, module="acme_blobs", source=BLOBS)
 
 

@@ -40,7 +40,6 @@ needs_bf16 = pytest.mark.skipif(
 
 
 def found(*, bf16):
-    """As if this OpenVINO were installed."""
     return lambda: OpenVinoCpu("2026.4", bf16=bf16)
 
 

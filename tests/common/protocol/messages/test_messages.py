@@ -125,7 +125,6 @@ def value_of(kind):  # noqa: C901, PLR0911, PLR0912 - one case for each kind
 
 
 def message_of(message):
-    """Any value of a message type."""
     values = {name: value_of(kind) for name, kind in kinds(message)}
     if message.NEGOTIATES:
         values |= {"lowest_version": st.integers(1, WIRE_VERSION)}

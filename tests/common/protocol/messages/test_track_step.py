@@ -21,7 +21,6 @@ START_NS = 1_790_000_000 * SECOND_NS
 
 
 def car_tracks(frame, boxes, *, classes=3, confidences=0.7, **more):
-    """A tracker's list."""
     return tracks_of(frame, boxes, classes=classes, confidences=confidences, **more)
 
 
@@ -50,7 +49,6 @@ def flight(steps, *, count=50, side_px=40, seed=0):
 
 
 def encoded(steps, *, refresh_ns=SECOND_NS):
-    """As the edge sends them."""
     encoder = TrackStepEncoder(session_id=2**63 + 1, refresh_ns=refresh_ns)
     return [
         encoder.encode(one, capture_ns=START_NS + one.frame_index * SECOND_NS // 15, send_delay_ns=9_000_000)
