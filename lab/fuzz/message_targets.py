@@ -193,6 +193,7 @@ TARGETS = (
     _streamed("backlog-header", wire.BacklogHeader, messages.BACKLOG),
     _message("status", wire.Status, [messages.STATUS]),
     _message("info", wire.Info, [messages.INFO]),
+    _message("info-request", wire.InfoRequest, [messages.INFO_REQUEST]),
     _message("control-request", wire.ControlRequest, REQUESTS),
     _message("control-answer", wire.ControlAnswer, [messages.ANSWER]),
     _message("feedback", wire.Feedback, [feedback(), feedback(stills=(), backlog=(), missing_stills=())]),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.config import (
@@ -198,32 +198,3 @@ def test_what_is_printed_reads_back_the_same(tmp_path_factory, config):
     back = read("--config", str(path))
     for one in dataclasses.fields(Camera):
         assert getattr(back, one.name) == getattr(config, one.name), one.name
-
-
-KINDS = {
-    "text": TEXT,
-    "path": PATH,
-    "bitrate": BITRATE,
-    "duration": DURATION,
-    "share": SHARE,
-    "size": SIZE,
-    "integer": integer(-3, 3),
-    "number": number(-1, 1),
-    "choice": choice("a", "b"),
-}
-
-
-@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
-@example("\r/")
-@given(
-    text=st.one_of(st.text(), st.from_regex(r"~?[0-9a-z./%x+-]{0,9}", fullmatch=True), st.just("9" * 5000))
-)
-def test_any_text_gives_a_value_or_a_sentence(kind, text):
-    """Some typing error would end in a traceback."""
-    try:
-        value = kind.parse(text, name="--it")
-    except UserError as error:
-        assert str(error).startswith("--it ")  # noqa: PT017 - most texts are no error
-    else:
-        shown = kind.show(value)
-        assert kind.parse(str(shown), name="--it") == value

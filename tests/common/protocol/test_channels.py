@@ -73,12 +73,6 @@ def test_a_foreign_key_is_none():
         assert parse_key(key) is None
 
 
-@given(key=st.text(max_size=60))
-def test_no_key_raises(key):
-    """The same for any text."""
-    parse_key(key)
-
-
 @given(edge=st.from_regex(r"[ab-]{1,8}", fullmatch=True), pattern=PATTERNS)
 def test_the_selector_and_the_pattern_agree(edge, pattern):
     """The ground would record edges that were not asked for, or miss some that were."""

@@ -1,12 +1,7 @@
 """What every still codec of HVT promises, one test for all of them."""
 
-import contextlib
-from functools import cache
-
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.runtime import plug_ins
@@ -106,24 +101,6 @@ def test_what_crosses_the_link_is_small(codec):
     assert len(parameters) <= 6
     assert all(len(key.encode()) <= 16 for key in parameters)
     assert len(codec.name) <= 24
-
-
-@cache
-def _middling(codec):
-    return encoded(codec, textured(*SIZE), 50)
-
-
-@given(draw=st.data(), noise=st.none() | st.binary(max_size=300))
-@settings(max_examples=65, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_hostile_bytes_only_raise_still_error(codec, draw, noise):
-    """One forged still would end the ground."""
-    crop, coded = textured(*SIZE), _middling(codec)
-    data = bytearray(coded.data)
-    for _ in range(draw.draw(st.integers(1, 3))):
-        at, gone = draw.draw(st.integers(0, len(data))), draw.draw(st.integers(0, 12))
-        data[at : at + gone] = draw.draw(st.binary(max_size=24))
-    with contextlib.suppress(StillError):
-        assert decoded(codec, coded, crop, bytes(data) if noise is None else noise).shape == crop.shape
 
 
 @pytest.mark.parametrize("name", ["jpeg", "webp", "avif", "jxl"])
