@@ -128,28 +128,6 @@ def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_po
         assert edges["rov-1"].reports == [b"base"]
 
 
-@pytest.mark.parametrize("listens", ["ground", "edge"])
-def test_direct_either_side_may_listen(fleet: Fleet, free_port: int, listens: str) -> None:
-    """A drone with a public address and a ground behind a home router: the same files have to do."""
-    where = (f"tls/127.0.0.1:{free_port}",)
-    there, here = (
-        ({"listen": where}, {"connect": where})
-        if listens == "ground"
-        else ({"connect": where}, {"listen": where})
-    )
-    with (
-        open_session(fleet.settings("base", "ground", **there)) as ground_session,
-        open_session(fleet.settings("uav-1", "edge", **here)) as edge_session,
-    ):
-        ground, edge = _Ground(ground_session), _Edge(edge_session, "uav-1")
-        eventually(edge.wanted, what="the streams are wanted")
-        edge.write()
-        eventually(lambda: set(ground.came) == _all(("uav-1",)), what="all rows arrive")
-        ground.answered(Channel.CONTROL, None, b"control of uav-1")
-        ground.report(b"base")
-        eventually(lambda: edge.reports == [b"base"], what="the report arrives")
-
-
 def test_who_asks_with_keys_of_another_fleet_is_told(fleet: Fleet, tmp_path: Path, free_port: int) -> None:
     """'Nobody answers' would be said of a ground that runs, and with keys may listen beyond this machine."""
     other = Fleet(tmp_path / "other")

@@ -81,26 +81,16 @@ def plays(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Play, P
     )
 
 
-def test_the_same_input_gives_the_same_base_stream(plays):
-    """No figure of a study could be made again."""
+def test_the_same_input_gives_the_same_pictures_stills_and_account(plays):
+    """No figure of a study could be made again, nor two runs be compared number by number."""
     one, two, _ = plays
     assert len(one.base) == FRAMES
     assert one.base == two.base
     samples = [[unit for _, _, unit in run.recording.video()] for run in (one, two)]
     assert len(samples[0]) == FRAMES
     assert samples[0] == samples[1]
-
-
-def test_the_same_input_gives_the_same_stills(plays):
-    """A method that is a little better would look a little worse on the next run."""
-    one, two, _ = plays
     assert one.edge["stills"]["sent"] == len(one.stills) > 5
     assert one.stills == two.stills
-
-
-def test_the_same_input_gives_the_same_account(plays):
-    """Two runs could not be compared number by number."""
-    one, two, _ = plays
     assert one.account == two.account
     for name in ("tracks", "detections_run", "frames_decoded", "meta_bytes", "worst_window_bps"):
         assert one.ground[name] == two.ground[name], name

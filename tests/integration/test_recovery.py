@@ -1,4 +1,4 @@
-"""Two edges of one id, stills that are lost, clocks that are set.
+"""Two edges of one id, clocks that are set, a camera that comes back.
 
 That a router goes is in fleet/test_group.py; that two edges of one id meet later in tests/ground/session.
 """
@@ -10,13 +10,11 @@ from typing import Any
 
 import pytest
 
-from hvt_common.protocol.messages import Feedback
-from lab.link.carriers.relay import Relay
+from hvt_common.protocol.messages import BaseHeader, Feedback, Flags, Status
 from lab.link.measures.timing import Arrival, read_timing
-from lab.link.timeline import LinkState, Phase, Script
 from programs.outsider import Tap, joined
 from programs.processes import Link, Running, eventually
-from programs.rrd import Recording
+from programs.rtsp_camera import RtspCamera
 
 pytestmark = pytest.mark.integration
 
@@ -75,52 +73,6 @@ def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     assert third.finish()["session"] in {one["session"] for one in as_list(ground.finish())}
 
 
-# Stills that are lost
-
-
-@pytest.mark.nightly
-def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
-    """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
-    state = LinkState(4_000_000, delay_s=0.01, loss=0.12)
-    lossy = Script((Phase(0.0, state),), lasts_s=60.0, queue_bytes=100_000)
-    records = (*SEES, "--record", "flight.rrd", "--timing", "timing.csv")
-    ground = link.start("hvt_ground.cli", ["--listen", f"udp/127.0.0.1:{link.port}", *records], name="ground")
-    ground.until("listening on")
-    with Relay(lossy, protocol="udp", target_port=link.port, seed=3) as relay:
-        settings = (
-            "--connect",
-            f"udp/127.0.0.1:{relay.port}",
-            *PLAYS,
-            "--still-codec",
-            "jpeg",
-            "--cooldown",
-            "0s",
-        )
-        many = ("--method", "M1", "--tune", "every_frames=20", "--min-gain", "1", "--gate", "60")
-        edge = link.start("hvt_edge.cli", [*settings, *many, "--video-share", "0.6"], name="edge")
-        more_is_shown(link.folder, than=0)
-        relay.begin()
-
-        def stills() -> list[int]:
-            return [one.sequence for one in read_timing(link.folder / "timing.csv") if one.kind == "roi"]
-
-        def came_late() -> bool:
-            return any(number < max(stills()[:place]) for place, number in enumerate(stills()) if place)
-
-        eventually(came_late, what="a still that was lost comes after later ones")
-        edge.stop()
-        ground.stop()
-    sent = edge.finish()["stills"]["reasons"]["sent"]
-    (seen,) = as_list(ground.finish())
-    arrived = stills()
-    assert sent["again"] >= 1
-    # Others may have come from the edge's store.
-    assert len(arrived) == len(set(arrived)) <= seen["stills"]["received"]
-    assert seen["stills"]["received"] <= sum(sent.values()) - sent["again"]
-    shown_stills = [value for _, value in Recording(link.folder / "flight.rrd").stills()]
-    assert len(shown_stills) == len(set(shown_stills))
-
-
 # Clocks that are set
 
 
@@ -163,3 +115,53 @@ def test_clocks_that_are_set_leave_no_trace(link: Link, monkeypatch: pytest.Monk
     assert all(one.delay_p50_ms < 60_000 and abs(one.clock_offset_ns) < 60e9 for one in reports)
     captured_s = [one.capture_s for one in shown(link.folder)]
     assert max(captured_s) - min(captured_s) < 300
+
+
+# A camera that comes back
+
+
+@pytest.mark.nightly
+def test_a_camera_that_comes_back_begins_with_a_keyframe(link: Link, free_port: int):
+    """The operator would look at smear after each loose contact, or never learn why the picture stands.
+
+    Nor is the flight stored for somebody who listens and reports nothing, as a plain Zenoh program does.
+    """
+    with RtspCamera(free_port) as camera:
+        edge = link.edge(
+            *(
+                "--source",
+                camera.url,
+                *PLAYS[2:],
+                "--wait",
+                "0s",
+                "--store",
+                "20MB",
+                "--store-folder",
+                "store",
+            ),
+            listens=True,
+        )
+        with joined(link.edge_endpoint) as session:
+            base, status = (Tap(session, f"hvt/uav-1/{row}") for row in ("base", "status"))
+
+            def units() -> list[BaseHeader]:
+                return [BaseHeader.parse(one.attachment, one.payload) for one in base.messages]
+
+            def source_works() -> bool | None:
+                parts = Status.parse(status.messages[-1].payload).failed if status.messages else ()
+                return next((one.working for one in parts if one.part == "source"), None)
+
+            eventually(lambda: len(units()) > 5, what="video comes")
+            camera.close()
+            eventually(lambda: source_works() is False, what="status says so, without a frame")
+            count = len(units())
+            with RtspCamera(free_port):
+                eventually(lambda: len(units()) > count + 5, what="video comes back")
+                eventually(source_works, what="status says so")
+                edge.stop()
+            first, again = units()[0], units()[count]
+    assert again.flags & Flags.KEYFRAME
+    summary = edge.summary()
+    assert summary["failed"][0]["part"] == "source"
+    assert summary["frames_stored"] <= first.frame_index + 1, "but what came before anybody watched"
+    assert summary["total_bps"] <= 300_000

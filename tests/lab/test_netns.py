@@ -84,10 +84,6 @@ def script(*pieces: tuple[float, LinkState], lasts_s: float) -> Script:
     return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=16_000)
 
 
-def namespaces() -> str:
-    return subprocess.check_output(["ip", "netns", "list"], text=True)
-
-
 def test_the_shaper_follows_the_script(wire_field):
     """The one carrier with a real TCP would be another link than the relay's: kinder, or no link at all."""
     slow_bps, rate_bps, step_s = 400_000, 1_000_000, 1.0
@@ -136,23 +132,3 @@ def flooded_share() -> float:
                 return int(receiver.communicate()[0]) / 4000
     except UnavailableError as error:
         pytest.skip(str(error))
-
-
-def test_nothing_is_left_behind():
-    """The machine would fill with namespaces."""
-    try:
-        with Namespaces(script((0, LinkState(5_000_000)), lasts_s=1)) as link:
-            link.begin()
-            assert all(name in namespaces() for name in link.names.values())
-    except UnavailableError as error:
-        pytest.skip(str(error))
-    assert not any(
-        name in namespaces() for name in link.names.values()
-    )  # another run may have some of its own
-
-
-def test_what_is_missing_is_named(monkeypatch):
-    """`make link CARRIER=netns` on a laptop would end in a traceback."""
-    monkeypatch.setenv("PATH", "/nonexistent")
-    with pytest.raises(UnavailableError, match="needs the command ip"):
-        Namespaces(script((0, LinkState(1)), lasts_s=1)).__enter__()

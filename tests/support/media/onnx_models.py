@@ -208,31 +208,3 @@ def failing_in_the_light(path: Path, *, size: tuple[int, int] = (320, 192)) -> P
     onnx.checker.check_model(model)
     path.write_bytes(model.SerializeToString())
     return path
-
-
-def slow_detector(path: Path, *, size: tuple[int, int] = (320, 192)) -> Path:
-    """A colour detector of the YOLOX kind that takes 50 GFLOP a run: a tenth of a second and more of any one core."""
-    layers, channels = 11, 64
-    model = onnx.load(colour_detector(path, "yolox", size=size))
-    (output,) = model.graph.output
-    model.graph.node[-1].output[0] = "plain"
-    noise = np.random.default_rng(1)
-    for layer in range(layers):
-        shape = (channels, channels if layer else 3, 3, 3)
-        weights = noise.standard_normal(shape).astype(np.float32) / 24
-        model.graph.initializer.append(numpy_helper.from_array(weights, f"heavy_w{layer}"))
-        taken = f"heavy{layer - 1}" if layer else "images"
-        model.graph.node.append(
-            helper.make_node("Conv", [taken, f"heavy_w{layer}"], [f"heavy{layer}"], pads=[1, 1, 1, 1])
-        )
-    model.graph.initializer.append(numpy_helper.from_array(np.float32(1e-12), "hardly"))
-    model.graph.node.extend(
-        [
-            helper.make_node("ReduceMean", [f"heavy{layers - 1}"], ["mean"], keepdims=0),
-            helper.make_node("Mul", ["mean", "hardly"], ["nothing"]),
-            helper.make_node("Add", ["plain", "nothing"], [output.name]),  # or it would not be computed
-        ]
-    )
-    onnx.checker.check_model(model)
-    path.write_bytes(model.SerializeToString())
-    return path
