@@ -63,7 +63,7 @@ def test_known_motion_is_measured(ground, scale, median_px, worst_px):
     """Tracks and moving-object masks would be shifted against the ground by the error, every frame."""
     rng, motion = np.random.default_rng(3), CameraMotion(scale=scale)
     errors, last = [], None
-    for camera in flight(steps=16, pan_px=20, zoom=0.02, turn=1.0, seed=5):
+    for camera in flight(steps=8, pan_px=20, zoom=0.02, turn=1.0, seed=5):
         estimate = motion.step(shot(ground, camera, rng))
         assert estimate.shape == (2, 3)
         assert estimate.dtype == np.float64
@@ -125,7 +125,7 @@ def follow(ground, *, camera_motion, every):
     world = np.array([[420, 200], [500, 260], [600, 240], [460, 350], [560, 330], [650, 310]], float)
     tracker = ByteTracker(TrackerSettings(camera_motion=camera_motion), fps=15)
     listed = []
-    for k, camera in enumerate(flight(steps=25, pan_px=30, zoom=0.02, turn=1.5, seed=9)):
+    for k, camera in enumerate(flight(steps=13, pan_px=30, zoom=0.02, turn=1.5, seed=9)):
         image = shot(ground, camera, rng)
         centre = world @ camera[:, :2].T + camera[:, 2] + rng.normal(0, 0.5, world.shape)
         half = np.array([10, 8])

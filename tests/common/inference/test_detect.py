@@ -16,7 +16,6 @@ from hvt_common.inference.letterbox import Letterbox, Letterboxer, Preparation, 
 from hvt_common.inference.nms import MAX_CANDIDATES, MAX_DETECTIONS, suppress
 from hvt_common.inference.runtimes.model import open_model
 from hvt_common.values import Image
-from hvt_models.detectors.motion import MotionDetector
 from hvt_models.forms import Dense, Listed, PerQuery
 from media.head_models import family_model
 from media.onnx_models import (
@@ -97,17 +96,6 @@ def test_ultralytics_boxes_come_out_exactly_and_suppressed_by_class(tmp_path):
     np.testing.assert_allclose(found.boxes_xyxy_px, [[20, 15, 40, 25], [24, 15, 44, 25], [45, 45, 55, 55]])
     twice = dense({3: [30, 20, 20, 10, 0.7, 0.0], 9: [31, 20, 20, 10, 0.0, 0.8]})
     assert found_in(tmp_path, twice).class_ids.tolist() == [1]
-
-
-def test_end_to_end_boxes_come_out_exactly(tmp_path):
-    """The newest YOLO models could not be used."""
-    table = empty(20, 6)
-    table[0, [2, 7, 8]] = [[5, 6, 30, 40, 0.6, 2], [5, 6, 31, 40, 0.9, 1], [5, 6, 31, 40, 0.2, 1]]
-    detector = answering(tmp_path, table, metadata={"names": RGB})
-    found = detector.detect(np.zeros((64, 64, 3), np.uint8))
-    assert [detector.class_names[i] for i in found.class_ids] == ["green", "blue"]
-    np.testing.assert_allclose(found.boxes_xyxy_px, [[5, 6, 31, 40], [5, 6, 30, 40]])
-    assert answering(tmp_path, table).class_names[:2] == ("class 0", "class 1")
 
 
 def test_broken_numbers_never_become_detections(tmp_path):
@@ -367,17 +355,6 @@ def test_a_picture_full_of_boxes_costs_no_more_than_what_is_returned(monkeypatch
 # --- opening -------------------------------------------------------------------------------------------------------
 
 
-def test_float16_models_are_fed_float16(tmp_path):
-    """Half-precision exports for small GPUs could not be used."""
-    image = np.zeros((64, 64, 3), np.uint8)
-    image[16:24, 40:48, 1] = 255
-    for head in ("yolox", "ultralytics"):
-        path = colour_detector(tmp_path / "m.onnx", head, dtype=np.float16)
-        found = open_detector(str(path), confidence=0.9).detect(image)
-        np.testing.assert_allclose(found.boxes_xyxy_px, [[40, 16, 48, 24]], atol=0.05)
-        assert found.class_ids.tolist() == [1]
-
-
 def test_a_free_input_takes_the_size_of_the_image_or_of_the_user(tmp_path):
     """Small objects would be shrunk away, or a panorama would take all memory."""
     path = colour_detector(tmp_path / "m.onnx", "yolox", size=None)
@@ -479,12 +456,6 @@ def test_settings_out_of_range_are_refused(tmp_path, setting, metadata, words):
     path = colour_detector(tmp_path / "m.onnx", "yolox", metadata=metadata)
     with pytest.raises(UserError, match=words):
         open_detector(str(path), **setting)
-
-
-def test_motion_is_a_detector_by_name():
-    """A flight without weights would have no detector."""
-    detector = open_detector("motion", confidence=0.4)
-    assert (type(detector), detector.class_names) == (MotionDetector, ("moving",))
 
 
 # --- real models ---------------------------------------------------------------------------------------------------

@@ -300,9 +300,9 @@ def test_lost_tracks_are_remembered_in_frames_not_in_updates(every, hidden_frame
     assert listed[-1].ids.tolist() == ([1] if same else [2])
 
 
-@pytest.mark.parametrize("every_s", [1.0, 1.1, 1.5, 2.0, 3.0, 5.0])
+@pytest.mark.parametrize("every_s", [1.0, 1.5, 5.0])
 @pytest.mark.parametrize("predicted", [0, 2, None], ids=["none", "some", "all"])
-@pytest.mark.parametrize("lengths_per_s", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize("lengths_per_s", [0.0, 0.3])
 def test_a_slow_machine_lists_what_stands_or_moves_slowly(every_s, predicted, lengths_per_s):
     """With a detection in some seconds, a board would burn a core for nothing, and show nothing."""
     tracker, fps = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15), 15
@@ -612,14 +612,14 @@ def test_a_detector_that_hangs_takes_no_more_memory_with_each_frame():
     hanging.predict(frame_index=0, searched=True)
     tracemalloc.start()
     try:
-        for k in range(1, 4000):
+        for k in range(1, 1000):
             hanging.predict(frame_index=k)
-        assert tracemalloc.get_traced_memory()[0] < 50_000
+        assert tracemalloc.get_traced_memory()[0] < 20_000
     finally:
         tracemalloc.stop()
-    at_once.predict(frame_index=3999)
+    at_once.predict(frame_index=999)
     assert hanging.update_late(seen((0, 0, 40, 40))).ids.tolist() == [1]
-    assert len(hanging.extrapolated(frame_index=3999)) == len(at_once.extrapolated(frame_index=3999)) == 0
+    assert len(hanging.extrapolated(frame_index=999)) == len(at_once.extrapolated(frame_index=999)) == 0
 
 
 def test_the_class_follows_the_votes():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.tracking.recall import Recall
@@ -79,6 +79,7 @@ def test_the_newest_seconds_count():
     assert recall.share(CAR) == 0.0, "minutes ago"
 
 
+@settings(max_examples=30)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 80), st.integers(0, 80)), max_size=30))
 def test_what_is_listed_is_as_likely_as_the_formula_says(counts):
     """Whatever was counted, nobody is believed more than a detector, and the border is where the formula puts it."""

@@ -1,11 +1,10 @@
 """A second publisher on an edge's keys that says valid things as fast as it can, in a process of its own.
 
-    python flooder.py KIND ENDPOINT --edge uav-1 --seconds 4
+    python flooder.py KIND HEARS SAYS SECONDS
 
-It listens to the edge first, so that what it says is of the session that runs. Prints how much it said.
+It listens to edge ``uav-1`` first, so that what it says is of the session that runs. Prints how much it said.
 """
 
-import argparse
 import json
 import sys
 import time
@@ -99,45 +98,26 @@ def reports(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
         )
 
 
-KINDS: dict[str, Callable[[dict[Channel, list[Message]]], Iterator[Said]]] = {
-    "copies": copies,
-    "ahead": ahead,
-    "statuses": statuses,
-    "backlog": past,
-    "reports": reports,
+KINDS: dict[str, tuple[Callable[[dict[Channel, list[Message]]], Iterator[Said]], tuple[Channel, ...]]] = {
+    "copies": (copies, (Channel.BASE, Channel.ROI, Channel.STATUS)),
+    "ahead": (ahead, (Channel.BASE, Channel.ROI)),
+    "statuses": (statuses, (Channel.STATUS,)),
+    "backlog": (past, (Channel.BASE,)),
+    "reports": (reports, (Channel.FEEDBACK,)),
 }
-NEEDED = {
-    "copies": (Channel.BASE, Channel.ROI, Channel.STATUS),
-    "ahead": (Channel.BASE, Channel.ROI),
-    "statuses": (Channel.STATUS,),
-    "backlog": (Channel.BASE,),
-    "reports": (Channel.FEEDBACK,),
-}
+"""By kind: what is said, and the rows that have to be heard before."""
+KEYS = EdgeKeys("uav-1")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("kind", choices=[*KINDS, "questions"])
-    parser.add_argument("--hear", required=True)
-    parser.add_argument("--say", required=True)
-    parser.add_argument("--edge", default="uav-1")
-    parser.add_argument("--seconds", type=float, default=4.0)
-    asked = parser.parse_args()
-    keys = EdgeKeys(asked.edge)
-    with joined(asked.hear) as ears, joined(asked.say) as mouth:
-        if asked.kind == "questions":
-            said = ask(mouth, keys, seconds=asked.seconds)
-        else:
-            said = say(
-                asked.kind, listened(ears, keys, NEEDED[asked.kind]), mouth, keys, seconds=asked.seconds
-            )
+    kind, hears, says, seconds = sys.argv[1:]
+    with joined(hears) as ears, joined(says) as mouth:
+        said = ask(mouth, float(seconds)) if kind == "questions" else say(kind, ears, mouth, float(seconds))
     print(json.dumps(said))
 
 
-def listened(
-    session: zenoh.Session, keys: EdgeKeys, needed: tuple[Channel, ...]
-) -> dict[Channel, list[Message]]:
-    tap, end_s = Tap(session, f"hvt/{keys.edge}/**"), time.monotonic() + 40
+def listened(session: zenoh.Session, needed: tuple[Channel, ...]) -> dict[Channel, list[Message]]:
+    tap, end_s = Tap(session, f"hvt/{KEYS.edge}/**"), time.monotonic() + 40
     while time.monotonic() < end_s:
         heard: dict[Channel, list[Message]] = {row: [] for row in Channel}
         for message in tap.messages:
@@ -148,14 +128,12 @@ def listened(
     sys.exit(f"nothing came on {', '.join(row for row in needed if not heard[row])}")
 
 
-def say(
-    kind: str, heard: dict[Channel, list[Message]], session: zenoh.Session, keys: EdgeKeys, *, seconds: float
-) -> dict[str, float]:
+def say(kind: str, ears: zenoh.Session, mouth: zenoh.Session, seconds: float) -> dict[str, float]:
+    flood, needed = KINDS[kind]
+    heard = listened(ears, needed)
     end_s, said, size_bytes = time.monotonic() + seconds, 0, 0
-    for row, payload, attachment in KINDS[kind](heard):
-        session.put(
-            keys[row], payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK
-        )
+    for row, payload, attachment in flood(heard):
+        mouth.put(KEYS[row], payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
         said += 1
         size_bytes += len(payload)
         if said % 16 == 0 and time.monotonic() > end_s:
@@ -163,7 +141,7 @@ def say(
     return {"said": said, "bytes": size_bytes}
 
 
-def ask(session: zenoh.Session, keys: EdgeKeys, *, seconds: float) -> dict[str, float]:
+def ask(session: zenoh.Session, seconds: float) -> dict[str, float]:
     """Questions on control that the edge understands: keyframes, and stills of any place."""
     questions = [
         ControlRequest(session_id=0, command=command, arguments=arguments).pack()
@@ -180,7 +158,7 @@ def ask(session: zenoh.Session, keys: EdgeKeys, *, seconds: float) -> dict[str, 
         answered += 1
 
     while time.monotonic() < end_s:
-        session.get(keys[Channel.CONTROL], heard, payload=questions[said % len(questions)], timeout=1.0)
+        session.get(KEYS[Channel.CONTROL], heard, payload=questions[said % len(questions)], timeout=1.0)
         said += 1
     time.sleep(1.2)
     return {"said": said, "answered": answered}

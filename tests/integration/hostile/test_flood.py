@@ -72,9 +72,7 @@ class Flight:
         to_edge = kind in ("reports", "questions")
         say = self.link.edge_endpoint if to_edge else self.link.ground_endpoint
         hear = self.link.ground_endpoint if kind == "reports" else self.link.edge_endpoint
-        command = [
-            *(sys.executable, str(_FLOODER), kind, "--hear", hear, "--say", say, "--seconds", str(_SECONDS))
-        ]
+        command = [sys.executable, str(_FLOODER), kind, hear, say, str(_SECONDS)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as flooder:
             try:
                 while flooder.poll() is None:

@@ -95,21 +95,6 @@ def test_a_broken_plug_in_is_named(installed, names, answer, says):
         open_detector("acme")
 
 
-def test_names_that_mean_something_else_are_refused(installed, tmp_path):
-    """What --detector aerial-nano is would depend on what else is installed."""
-    installed({"aerial-nano": "BlobDetector"}, module="acme_blobs", source=BLOBS)
-    with pytest.raises(
-        UserError, match=r"'aerial-nano' is built in, and package acme_blobs .* brings another"
-    ):
-        open_detector("aerial-nano")
-    installed({"acme": "BlobDetector"}, module="acme_one", source=BLOBS)
-    installed({"acme": "BlobDetector"}, module="acme_two", source=BLOBS)
-    with pytest.raises(UserError, match="detector 'acme' comes from both package acme_"):
-        open_detector("acme")
-    with pytest.raises(UserError, match=r"detector .acmee. is not known \(did you mean acme\?\)"):
-        open_detector("acmee")
-
-
 @pytest.mark.usefixtures("blobs")
 def test_it_is_listed_and_scored(tmp_path, capsys):
     """Nobody could say how good the runtime's network is on his pictures, nor see that HVT has found it."""
