@@ -17,23 +17,19 @@ DOCUMENTS = ("README.md", "CONTRIBUTING.md", *PAGES)
 MOST_WORDS = 1200
 # Of other programs, of every command, or of the makers of the settings themselves.
 OTHER_FLAGS = {
-    "--help",
-    "--help-all",
-    "--version",
-    "--config",
-    "--print-config",
-    "--name",
-    "--no-name",
-    "--build",
-    "--now",
+    *[
+        "--help",
+        "--help-all",
+        "--version",
+        "--config",
+        "--print-config",
+        "--name",
+        "--no-name",
+        "--build",
+        "--now",
+    ],
     # Of programs that docs/small-boards.md starts.
-    "--codec",
-    "--framerate",
-    "--height",
-    "--libav-format",
-    "--python",
-    "--user",
-    "--width",
+    *["--codec", "--framerate", "--height", "--libav-format", "--python", "--user", "--width"],
 }
 
 

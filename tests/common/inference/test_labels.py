@@ -152,7 +152,7 @@ def test_every_imagenet_row_of_the_table_is_an_imagenet_class(data):
     """A typo in the table would cost one class of vehicles its kind."""
     labels = read_labels(data / "models/imagenet_labels_1001.txt")
     words = {
-        *(
+        *[
             "minivan",
             "sports car",
             "convertible",
@@ -162,7 +162,7 @@ def test_every_imagenet_row_of_the_table_is_an_imagenet_class(data):
             "beach wagon",
             "racer",
             "model t",
-        ),
+        ],
         *("minibus", "school bus", "trolleybus", "trailer truck", "moving van", "pickup", "garbage truck"),
         *("tow truck", "fire engine", "moped", "motor scooter", "police van", "ambulance", "golfcart"),
     }

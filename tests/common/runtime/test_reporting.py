@@ -148,3 +148,38 @@ def test_a_reader_that_leaves_ends_the_program_without_a_word(reader, unbuffered
     )
     assert told.stderr == ""
     assert told.stdout.splitlines()[-1] == "1"
+
+
+FLIGHT = """
+import logging, sys
+from pathlib import Path
+from hvt_common.errors import exit_with_sentence
+from hvt_common.runtime.log import start_log
+from hvt_common.runtime.process import leave
+from hvt_common.runtime.reporting import StatusLine, print_table, write_json
+def fly(argv):
+    log = start_log("it", quiet=False, form="text")
+    with StatusLine(quiet=False) as line:
+        for number in range(9):
+            line.show(f"frame {number}")
+        line.note("noted")
+        logging.getLogger("hvt_edge").warning("warned")
+    print_table("table", [("a", "b")])
+    log.release()
+    write_json(Path(argv[0]), {"frames": number})
+    return 0
+leave(exit_with_sentence(fly, program="it", argv=sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("full", [False, True], ids=["dead pipe", "full disk"])
+def test_a_flight_goes_on_when_nobody_reads_its_status(tmp_path, full):
+    """The video, or the recording, would end with the terminal or the log's disk from which it was started."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as dead, Path("/dev/full").open("wb") as disk:
+        output = disk if full else dead
+        words = [sys.executable, "-c", FLIGHT, str(tmp_path / "s.json")]
+        done = subprocess.run(words, stdout=output, stderr=output, check=False)
+    assert done.returncode == 0
+    assert json.loads((tmp_path / "s.json").read_text()) == {"frames": 8}

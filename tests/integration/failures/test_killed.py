@@ -1,6 +1,7 @@
 """A flight in which an edge and the ground are killed with -9 and started again, while another edge flies on."""
 
 import json
+import shlex
 import signal
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,22 +20,11 @@ from programs.rrd import Recording
 pytestmark = pytest.mark.integration
 
 
-EDGE = (
-    *(
-        "--size",
-        "320x192",
-        "--fps",
-        "10",
-        "--source-fps",
-        "10",
-        "--preset",
-        "ultrafast",
-        "--budget",
-        "300kbps",
-    ),
-    *("--detector", "motion", "--wait", "60s", "--method", "M5", "--keyframe-interval", "2s"),
+EDGE = shlex.split(
+    "--size 320x192 --fps 10 --source-fps 10 --preset ultrafast --budget 300kbps"
+    " --detector motion --wait 60s --method M5 --keyframe-interval 2s"
 )
-GROUND = ("--detector", "motion", "--classifier", "none", "--record", "flights", "--split", "3s")
+GROUND = shlex.split("--detector motion --classifier none --record flights --split 3s")
 
 
 @dataclass

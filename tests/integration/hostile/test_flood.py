@@ -6,6 +6,7 @@ be shown while somebody else counts on in the edge's name; it has to come back, 
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 import time
@@ -27,10 +28,9 @@ _FLOODER = Path(__file__).with_name("flooder.py")
 _SECONDS = 2.5
 _GROWTH_MB, _GROWTH_SHARE = 60.0, 0.1
 """So much may either process grow over all floods, and by so much of what they said: most of it would be a leak."""
-_EDGE = (
-    *("--source-fps", "10", "--fps", "10", "--size", "640x360", "--preset", "ultrafast"),
-    *("--budget", "300kbps"),
-    *("--edge-id", "uav-1", "--method", "M1", "--send-tracks", "--no-adapt", "--keyframe-interval", "60s"),
+_EDGE = shlex.split(
+    "--source-fps 10 --fps 10 --size 640x360 --preset ultrafast --budget 300kbps --edge-id uav-1 --method M1"
+    " --detector motion --send-tracks --no-adapt --keyframe-interval 60s"
 )
 
 

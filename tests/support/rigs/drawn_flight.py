@@ -81,17 +81,8 @@ def fly(link: Link, *ground: str, edge: tuple[str, ...] = ()) -> tuple[dict[str,
     )
     flying = link.edge(
         *("--source", "demo", "--seed", str(SEED), "--max-frames", str(FRAMES), "--edge-id", "uav-1"),
-        *(
-            "--size",
-            f"{SIZE[0]}x{SIZE[1]}",
-            "--budget",
-            "800kbps",
-            "--preset",
-            "ultrafast",
-            "--wait",
-            "60s",
-            *edge,
-        ),
+        *f"--size {SIZE[0]}x{SIZE[1]} --budget 800kbps --preset ultrafast --wait 60s".split(),
+        *edge,
     )
     return flying.finish(), running.finish(), running.said
 
