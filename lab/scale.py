@@ -26,7 +26,7 @@ from rich.table import Table
 from hvt_common.protocol.channels import Channel, EdgeKeys, parse_key, selector
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
-from hvt_ground.link.group import GroundGroup
+from hvt_fleet.link.group import GroundGroup
 from lab.link.carriers.star import Star
 
 _ROUTER = Path(__file__).resolve().parents[1] / "deploy" / "router.py"

@@ -29,7 +29,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
 from hvt_ground.extras import Service, extras_of, part_of
-from hvt_ground.link.group import GroundGroup
+from hvt_ground.link.group import Group
 from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
 from hvt_ground.session.edge_port import EdgePort
@@ -220,10 +220,10 @@ class Ground:
         # Serve its edges; returns whether to go on with another session.
         config = self._config
         with ExitStack() as stack:
-            group = None
+            group: Group | None = None
             if config.group is not None:
                 shown = next((one.shown_to_others for one in parts.services if one.shown_to_others), "")
-                group = stack.enter_context(GroundGroup(session, config.group, page=shown))
+                group = stack.enter_context(link_doctor().share_edges(session, config.group, page=shown))
             attempt = parts.models.failures.attempt
             logs = ((part_of(one), one.message_log) for one in parts.services if one.message_log is not None)
             log = next((partial(attempt, part, log, None) for part, log in logs), None)
@@ -272,7 +272,7 @@ class Ground:
             yet = "not yet, " * (page != parts.page and "web page" in late)
             note(f"hvt-ground: {yet}watch at {page}")
 
-    def _serve(self, link: GroundLink, parts: _Parts, watch: LinkWatch, group: GroundGroup | None) -> None:
+    def _serve(self, link: GroundLink, parts: _Parts, watch: LinkWatch, group: Group | None) -> None:
         config, models, line, polls = self._config, parts.models, parts.line, 0
         maker = StateMaker(
             self._clock,

@@ -36,9 +36,9 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_common.transport.link_doctor import Rights, control_unanswered
+from hvt_common.transport.link_doctor import control_unanswered, link_doctor
 from hvt_common.transport.session import open_session, query, subscribe
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.values import Image
 from hvt_common.video.still_codecs import StillError
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
@@ -103,34 +103,6 @@ def check_suffix(path: Path) -> None:
         raise UserError(f"{path} is not a picture that can be written: name it {', '.join(_SUFFIXES)}")
 
 
-@dataclass(frozen=True, slots=True)
-class Requester:
-    """The rights in our own file."""
-
-    file: Path | None
-    rights: Rights
-
-    @classmethod
-    def of(cls, settings: LinkSettings) -> Requester:
-        """From the settings of the session; `UserError` where they cannot be used."""
-        return cls(settings.zenoh_config, Rights.of(configure(settings)[0]))
-
-    def refusal(self, edge: str) -> str:
-        """Why ``control`` of this edge need not be tried; empty where our own file allows it."""
-        key = EdgeKeys(edge)[Channel.CONTROL]
-        if self.rights.allow_somebody(flow="egress", message="query", key=key):
-            return ""
-        if self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge)[Channel.INFO]):
-            return (
-                f"{self.file} lets us watch {edge}, not command it: a key that hvt-ground keys add-ground makes "
-                "without --watch-only may"
-            )
-        return (
-            f"{self.file} does not name {edge}: hvt-ground keys list shows who may watch it, and a file that was "
-            "written before the edge was added has to be copied again"
-        )
-
-
 def _link_hint(session: zenoh.Session) -> str:
     # Names the other end by its key; empty without keys. An asker has one link.
     names = sorted({link.auth_identifier for link in session.info.links() if link.auth_identifier})
@@ -149,11 +121,11 @@ class RemoteEdge:
     where it says no.
     """
 
-    def __init__(self, session: zenoh.Session, edge: str, *, requester: Requester) -> None:
+    def __init__(self, session: zenoh.Session, edge: str, *, refusal: Callable[[str], str]) -> None:
         self.name = edge
         self._session = session
         self._keys = EdgeKeys(edge)
-        self._requester = requester
+        self._refusal = refusal
 
     def info(self) -> Info:
         answer = self._query(Channel.INFO, b"")
@@ -305,7 +277,7 @@ class RemoteEdge:
         return answer
 
     def _check_may_command(self) -> None:
-        if refusal := self._requester.refusal(self.name):
+        if refusal := self._refusal(self.name):
             raise UserError(refusal)
 
     def _query(self, row: Channel, question: bytes) -> bytes | None:
@@ -337,7 +309,7 @@ class EdgeClient:
     ) -> None:
         """Ask through a session that is open, which its owner closes; ``settings`` are those that it has."""
         self._session = session
-        self._requester = Requester.of(settings)
+        self._refusal = link_doctor().refusals(settings)
         self._stack = stack or ExitStack()
 
     @classmethod
@@ -364,7 +336,7 @@ class EdgeClient:
         return sorted({key[0] for key in keys if key is not None})
 
     def __getitem__(self, edge: str) -> RemoteEdge:
-        return RemoteEdge(self._session, edge, requester=self._requester)
+        return RemoteEdge(self._session, edge, refusal=self._refusal)
 
     def close(self) -> None:
         self._stack.close()

@@ -12,7 +12,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Self
+from contextlib import AbstractContextManager
+from typing import Any, Self
 
 import zenoh
 
@@ -20,10 +21,11 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
 from hvt_common.transport.stale_sockets import end_of
-from hvt_common.transport.zenoh_config import LinkSettings, connect_endpoints
+from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 from hvt_fleet.link.certificate import SOON_S, TlsFiles, check_own_keys, dated, shown_to_callers
 from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
 from hvt_fleet.link.probe import why_no_link
+from hvt_fleet.link.rights import Rights, refusals
 from hvt_fleet.link.strangers import Strangers, listening_ports
 
 _log = logging.getLogger(__name__)
@@ -55,11 +57,12 @@ class Watch(LinkWatch):
         patience_s: float = PATIENCE_S,
         examine: Callable[[zenoh.Config], list[str]] | None = None,
     ) -> None:
-        super().__init__(settings)
+        self._config, listen = configure(settings)
+        self._rights = Rights.of(self._config)
         self._session = session
         self._patience_s = patience_s
         self._examine = examine or visit
-        self._strangers = Strangers(listening_ports(self.listen))
+        self._strangers = Strangers(listening_ports(listen))
         # A link that stood for less than a look was one all the same.
         self._link_events = session.info.declare_link_events_listener(
             zenoh.handlers.RingChannel(_MOST_EVENTS), history=True
@@ -67,17 +70,17 @@ class Watch(LinkWatch):
         self._file = settings.zenoh_config
         self._edge = settings.name
         self._served = served
-        self._shown = shown_to_callers(self.config, listen=self.listen)
+        self._shown = shown_to_callers(self._config, listen=listen)
         self._ages = min(1, self._age())
         """How often its age has been told: the start tells of one that ends soon."""
         self._trouble = ""
         self._said_s = 0.0
-        self._two_links = _connected_twice(self.config)
+        self._two_links = _connected_twice(self._config)
         """Places that are called twice."""
         self._had_two: set[str] = set()
         self._halved_s: float | None = None
         """The time since which one link of two has been missing; infinite once that is reported."""
-        self._ports = {end_of(one).rpartition(":")[2] for one in connect_endpoints(self.config)}
+        self._ports = {end_of(one).rpartition(":")[2] for one in connect_endpoints(self._config)}
         self._calls_since_s: float | None = None if settings.role == "ground" else math.inf
         """The time since which a ground has had a link to a peer that it calls; infinite once that is judged."""
         self._first_seen_s: dict[str, float] = {}
@@ -93,6 +96,10 @@ class Watch(LinkWatch):
     def trouble(self) -> str:
         """Why there is no link, in a sentence; empty while there is one, or nothing is known."""
         return self._trouble
+
+    def may_command(self, edge: str) -> bool:
+        """Whether our own configuration lets questions on ``control`` of this edge out at all."""
+        return self._rights.may_query(edge, Channel.CONTROL)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -232,7 +239,7 @@ class Watch(LinkWatch):
                 )
 
     def _explain(self) -> None:
-        reasons = self._examine(self.config)
+        reasons = self._examine(self._config)
         if not reasons or self._check(time.monotonic()):  # it came meanwhile, or this ends
             return
         trouble = "; ".join(reasons)
@@ -243,13 +250,13 @@ class Watch(LinkWatch):
         self._trouble = trouble
 
     def _check_names(self, names: dict[str, bool], now_s: float) -> None:
-        if not self.rights.enabled:
+        if not self._rights.enabled:
             return
         for name, router in names.items():
             if name in self._named or len(self._first_seen_s) >= _MAX_NAMES:
                 continue
             since_s = self._first_seen_s.setdefault(name, now_s)
-            if not self.rights.knows(name):
+            if not self._rights.knows(name):
                 sentence = self._stranger(name)
             elif now_s - since_s > self._patience_s and not router and self._is_hiding(name):
                 sentence = self._hidden(name)
@@ -271,7 +278,7 @@ class Watch(LinkWatch):
             key = EdgeKeys(name)[Channel.STATUS]
         except UserError:
             return False
-        return self.rights.allow(name, flow="ingress", message="put", key=key)
+        return self._rights.allow(name, flow="ingress", message="put", key=key)
 
     def _stranger(self, name: str) -> str:
         kind = "add-ground" if self._edge else "add-edge or add-ground"
@@ -304,11 +311,19 @@ def visit(config: zenoh.Config) -> list[str]:
         return [str(error)]
 
 
+def _share_edges(session: zenoh.Session, group: str, *, page: str) -> AbstractContextManager[Any]:
+    from hvt_fleet.link.group import GroundGroup  # noqa: PLC0415 - which imports the ground, and an edge has none
+
+    return GroundGroup(session, group, page=page)
+
+
 class Doctor(LinkDoctor):
     """The one of this extra."""
 
     check_keys = staticmethod(check_own_keys)
     check_id = staticmethod(refuse_duplicate_edge)
+    refusals = staticmethod(refusals)
+    share_edges = staticmethod(_share_edges)
     why_no_link = staticmethod(visit)
     watch = staticmethod(Watch)
 

@@ -17,7 +17,7 @@ from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.events import Traffic
-from hvt_ground.link.group import Elsewhere, GroundGroup
+from hvt_ground.link.group import Elsewhere, Group
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 
@@ -257,7 +257,7 @@ class StateMaker:
     failures: Failures | None = None
     loading: Callable[[], bool] = lambda: False
     recorded: bool = True
-    group: GroundGroup | None = None
+    group: Group | None = None
 
     def __post_init__(self) -> None:
         self._links: dict[str, tuple[LinkState, int]] = {}

@@ -16,7 +16,7 @@ from hvt_common.runtime.failures import RetryPause, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.session import another_key, subscribe
 from hvt_common.units import SECOND_NS
-from hvt_ground.link.group import GroundGroup
+from hvt_ground.link.group import Group
 from hvt_ground.perception.stills.decode import readable_codecs
 from hvt_ground.session.edge_port import EdgePort
 
@@ -50,7 +50,7 @@ class GroundLink:
         *,
         edges: str,
         clock: Callable[[], int] | None = None,
-        group: GroundGroup | None = None,
+        group: Group | None = None,
         log: Callable[[Received], None] | None = None,
         still_codecs: tuple[str, ...] | None = None,
         loses: Callable[[], bool] = lambda: False,
@@ -119,7 +119,7 @@ class GroundLink:
         if self.foreign:
             _log.warning("%d messages under keys that are not ours were skipped", self.foreign)
 
-    def _share(self, group: GroundGroup) -> None:
+    def _share(self, group: Group) -> None:
         with self._lock:
             known = self._alive | self._ports.keys()
         for edge in sorted(known - self._leaving):

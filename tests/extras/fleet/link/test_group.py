@@ -13,7 +13,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, GroupKeys
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
-from hvt_ground.link.group import GroundGroup, member_name, owner_of
+from hvt_fleet.link.group import GroundGroup, member_name, owner_of
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
 
