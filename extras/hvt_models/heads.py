@@ -18,20 +18,21 @@ from hvt_common.inference.heads.choose import (
     Trial,
     anchor_count,
     are_probabilities,
-    are_scores,
-    are_whole,
     is_raw,
     of_cells,
     tables,
 )
-from hvt_common.inference.heads.contract import MOST_RELATIVE, Array, rows_of
+from hvt_common.inference.heads.contract import Array, rows_of
 from hvt_common.inference.letterbox import Preparation
-from hvt_models.forms import Corners, Dense, Listed, Parallel, PerQuery
+from hvt_models.exports.forms import MOST_RELATIVE, Corners, Dense, Listed, Parallel, PerQuery
 
 _ANCHORS_A_CELL = 3
 """Anchors a cell of YOLOv5 and YOLOv7."""
 _BOX = 4
 _ADDS_UP = 1e-2
+_PADDING = -1
+_SCORE, _ANGLE = 0.05, 0.2
+"""On a grey picture the mean over all cells of a class is below the one, that of an angle above the other."""
 
 _RGB_1 = Preparation(mean=(0.0,) * 3, scale=(1 / 255,) * 3)
 _RGB_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3)
@@ -48,6 +49,44 @@ def _is_listed(trial: Trial, index: int) -> bool:
     return cells.isdisjoint(trial.shape(index)[-2:])
 
 
+def _named(trial: Trial, *words: str) -> tuple[int, ...]:
+    # The one output whose name is, or has, each word, in their order; () where one has none, or several.
+    names = [port.name.lower().partition(":")[0] for port in trial.ports]
+    found = [
+        [index for index, name in enumerate(names) if name == word]
+        or [index for index, name in enumerate(names) if word in name]
+        for word in words
+    ]
+    return tuple(one[0] for one in found) if all(len(one) == 1 for one in found) else ()
+
+
+def _has_whole(trial: Trial, index: int) -> bool:
+    # Whether an output has whole numbers by its type.
+    dtype = trial.ports[index].dtype
+    return dtype is not None and bool(np.issubdtype(dtype, np.integer))
+
+
+def _has_angles(trial: Trial, index: int, first: int, *, transposed: bool = False) -> bool:
+    # Whether the last column is no class as those from ``first`` on: on grey it alone has numbers.
+    grey = trial.runs[0][index].astype(np.float32).reshape(trial.shape(index)[-2:])
+    means = (grey.T if transposed else grey)[:, first:].mean(axis=0)
+    return bool(len(means) > 1 and means[-1] > _ANGLE > _SCORE > means[:-1].max())
+
+
+def _are_scores(numbers: Array) -> bool:
+    # Whether they are probabilities, or -1 as behind the end of a list.
+    return are_probabilities(numbers[numbers != _PADDING])
+
+
+def _are_whole(numbers: Array) -> bool:
+    # Whether all are whole numbers from -1 on, as classes are, and the padding behind them.
+    return bool(
+        np.isfinite(numbers).all()
+        and (numbers >= -1.001).all()
+        and (abs(numbers - numbers.round()) < 1e-3).all()
+    )
+
+
 # --- a row a cell ---------------------------------------------------------------------------------------------------
 
 
@@ -57,7 +96,7 @@ def _with_objectness(trial: Trial, *, constant: bool) -> Match | None:
         classes, table = trial.shape(index)[2] - 5, trial.table(index)
         if classes < 1 or not are_probabilities(table[:, 4:]) or is_raw(trial, index, strides):
             continue
-        if trial.has_angles(index, 5):
+        if _has_angles(trial, index, 5):
             continue
         ones = bool((abs(table[:, 4] - 1) < 1e-3).all())
         if ones != constant:
@@ -76,7 +115,7 @@ def _yolov8_rows(trial: Trial) -> Match | None:
         classes, table = trial.shape(index)[2] - 4, trial.table(index)
         if not are_probabilities(table[:, 4:]) or is_raw(trial, index, strides):
             continue
-        if trial.has_angles(index, 4):
+        if _has_angles(trial, index, 4):
             continue
         same = classes == trial.names
         proof = f"a row a cell in pixels and {classes} scores, as many as there are names" if same else None
@@ -103,7 +142,7 @@ def _yolov8(trial: Trial) -> Match | None:
         if shape[2] in counts
         and shape[1] >= LEAST_COLUMNS
         and are_probabilities(_scores(trial, index))
-        and not trial.has_angles(index, 4, transposed=True)
+        and not _has_angles(trial, index, 4, transposed=True)
     ]
     if not found or len({trial.shape(index) for index in found}) > 1:
         return None
@@ -159,9 +198,9 @@ def _with_image(trial: Trial, *, score: int, kind: int) -> Match | None:
     table = trial.table(index)
     proof = None
     if len(table):
-        if not are_probabilities(table[:, score]) or not are_whole(table[:, kind]):
+        if not are_probabilities(table[:, score]) or not _are_whole(table[:, kind]):
             return None
-        decided = not are_whole(table[:, score]) or float(table[:, kind].max()) > 1
+        decided = not _are_whole(table[:, score]) or float(table[:, kind].max()) > 1
         order = "score, class" if score < kind else "class, score"
         proof = f"rows of seven: image, x1 y1 x2 y2, {order}" if decided else None
     return Match((index,), None, Listed(1, score, kind, image=0), proof)
@@ -176,13 +215,19 @@ def _ssd(trial: Trial) -> Match | None:
 
 def _is_score_and_class(trial: Trial, index: int) -> bool:
     table = trial.table(index)
-    return are_scores(table[:, 4]) and are_whole(table[:, 5])
+    return _are_scores(table[:, 4]) and _are_whole(table[:, 5])
 
 
 def _shown(table: Array) -> Array:
     # (N, 4) boxes of the rows that are not padding.
     boxes = table[:, :4]
     return boxes[np.isfinite(boxes).all(axis=1) & (boxes > 0).any(axis=1)]
+
+
+def _are_shares(boxes: Array) -> bool:
+    # Whether there are boxes, and all are shares of the input.
+    size = float(np.abs(boxes).max(initial=0))
+    return 0 < size <= MOST_RELATIVE
 
 
 def _are_corners(boxes: Array) -> bool:
@@ -210,7 +255,7 @@ def _boxes_and_table(trial: Trial) -> tuple[int, int] | None:
         and trial.shape(boxes)[1] == trial.shape(scores)[1]
     ]
     if len(pairs) > 1:  # four classes: the box is named so
-        last = trial.named("pred_boxes", "pred_logits")
+        last = _named(trial, "pred_boxes", "pred_logits")
         names = [trial.ports[boxes].name.lower() for boxes, _ in pairs]
         boxed = [pair for pair, name in zip(pairs, names, strict=True) if "box" in name or "dets" in name]
         pairs = [pair for pair in boxed if pair == last] or boxed
@@ -222,9 +267,7 @@ def _yolo_nas(trial: Trial) -> Match | None:
     if pair is None or not are_probabilities(trial.table(pair[1])):
         return None
     boxes = trial.table(pair[0])
-    a_row_a_cell = (
-        not _is_listed(trial, pair[0]) and _are_corners(_shown(boxes)) and not trial.relative(boxes)
-    )
+    a_row_a_cell = not _is_listed(trial, pair[0]) and _are_corners(_shown(boxes)) and not _are_shares(boxes)
     proof = "boxes x1 y1 x2 y2 and scores, a row a cell" if a_row_a_cell else None
     scores_first = pair[1] < pair[0]  # DAMO-YOLO's, of pixels up to 255, and MMYOLO's
     return Match(
@@ -250,7 +293,7 @@ def _rt_detr(trial: Trial) -> Match | None:
     sigmoid = float(np.mean(sure)) < 0.5
     shown = _shown(boxes)
     said = (logits or "logit" in words) and not _are_corners(shown)
-    decided = trial.relative(boxes) and (said or _shows_centres(shown))
+    decided = _are_shares(boxes) and (said or _shows_centres(shown))
     proof = f"boxes by their centre in 0…1 and {'logits' if logits else 'scores'}, a row a query"
     found = Match(
         pair,
@@ -263,19 +306,21 @@ def _rt_detr(trial: Trial) -> Match | None:
 
 def _rf_detr(trial: Trial) -> Match | None:
     pair = _boxes_and_table(trial)
-    if pair is None or trial.named("dets", "labels") != pair:
+    if pair is None or _named(trial, "dets", "labels") != pair:
         return None
-    proof = "outputs dets and labels" if trial.relative(trial.table(pair[0])) else None
+    proof = "outputs dets and labels" if _are_shares(trial.table(pair[0])) else None
     return Match(pair, trial.shape(pair[1])[2], PerQuery("centre", logits=True), proof)
 
 
 def _nms_lists(trial: Trial) -> Match | None:
-    count = _only([i for i in range(len(trial.ports)) if np.prod(trial.shape(i)) == 1 and trial.whole(i)])
+    count = _only(
+        [i for i in range(len(trial.ports)) if np.prod(trial.shape(i)) == 1 and _has_whole(trial, i)]
+    )
     lists = _lists(trial, leave=count)
     if count is None or lists is None or "detection_boxes" in trial.ports[lists[0]].name:
         return None
     proof = "a count, boxes, scores and classes" if _are_corners_or_none(trial, lists[0]) else None
-    mmyolo = trial.named("num_dets", "boxes", "scores", "labels") == (count, *lists)  # RTMDet as YOLOv5
+    mmyolo = _named(trial, "num_dets", "boxes", "scores", "labels") == (count, *lists)  # RTMDet as YOLOv5
     return Match((*lists, count), None, Parallel(), _if_pixels_are(trial, proof, usual=not mmyolo))
 
 
@@ -286,13 +331,13 @@ def _labels_boxes_scores(trial: Trial) -> Match | None:
     said = "boxes, scores and classes (torchvision counts them from 1: its class 0 is the background)"
     proof = said if _are_corners_or_none(trial, lists[0]) else None
     # Those of SSD (ImageNet's means) and Custom Vision (0…255) are shares of the input, or called detected.
-    others = trial.relative(trial.table(lists[0])) or "detected" in trial.ports[lists[0]].name.lower()
+    others = _are_shares(trial.table(lists[0])) or "detected" in trial.ports[lists[0]].name.lower()
     return Match(lists, None, Parallel(), _if_pixels_are(trial, proof, usual=not others))
 
 
 def _tf_lists(trial: Trial) -> Match | None:
-    lists = trial.named("detection_boxes", "detection_scores", "detection_classes")
-    count = trial.named("num_detections")
+    lists = _named(trial, "detection_boxes", "detection_scores", "detection_classes")
+    count = _named(trial, "num_detections")
     if not lists or trial.shape(lists[0])[-1] != _BOX:
         return None
     proof = "outputs detection_boxes, detection_scores and detection_classes"
@@ -303,7 +348,7 @@ def _atss(trial: Trial) -> Match | None:
     boxes = _only([*tables(trial, 5)])
     if boxes is None:
         return None
-    kinds = _only([i for i in range(len(trial.ports)) if i != boxes and trial.whole(i)])
+    kinds = _only([i for i in range(len(trial.ports)) if i != boxes and _has_whole(trial, i)])
     if kinds is None or np.prod(trial.shape(kinds)) != np.prod(trial.shape(boxes)[:-1]):
         return None
     table = trial.table(boxes)
@@ -319,6 +364,11 @@ def _if_pixels_are(trial: Trial, proof: str | None, *, usual: bool) -> str | Non
     return proof if usual or "hvt.mean" in trial.metadata else None
 
 
+def _numbers(trial: Trial, index: int) -> Array:
+    # (N,) all numbers of an output of all pictures.
+    return np.concatenate([run[index].astype(np.float32).ravel() for run in trial.runs])
+
+
 def _lists(trial: Trial, *, leave: int | None) -> tuple[int, int, int] | None:
     # Outputs of boxes (…N, 4), scores (…N) and classes (…N); which is which is told by type, then by name.
     rest = [index for index in range(len(trial.ports)) if index != leave]
@@ -326,14 +376,14 @@ def _lists(trial: Trial, *, leave: int | None) -> tuple[int, int, int] | None:
     if boxes is None:
         return None
     long = [i for i in rest if i != boxes and trial.shape(i) == trial.shape(boxes)[:-1]]
-    kinds = _only([i for i in long if trial.whole(i)])
+    kinds = _only([i for i in long if _has_whole(trial, i)])
     if kinds is None:
         words = ("class", "label")
         kinds = _only([i for i in long if any(word in trial.ports[i].name.lower() for word in words)])
     scores = _only([i for i in long if i != kinds])
     if kinds is None or scores is None:
         return None
-    fits = are_scores(trial.numbers(scores)) and are_whole(trial.numbers(kinds))
+    fits = _are_scores(_numbers(trial, scores)) and _are_whole(_numbers(trial, kinds))
     return (boxes, scores, kinds) if fits else None
 
 

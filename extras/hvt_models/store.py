@@ -19,6 +19,7 @@ from typing import Any
 from hvt_common.errors import UserError, named_path, telling
 from hvt_common.files import read_text
 from hvt_common.inference.store import MOTION, embedded_models
+from hvt_models.exports.first_steps import own_steps
 from hvt_models.manifest import (
     MAX_SIZE_BYTES,
     ModelEntry,
@@ -81,6 +82,8 @@ class Store:
         entries = [entry for entry in self._builtin.values() if entry.size_bytes == size_bytes]
         same = [entry for entry in entries if file_digest(path) == entry.sha256]
         return same[0].classes if same else ""
+
+    own_steps = staticmethod(own_steps)
 
     def path(self, name: str) -> Path:
         """The path of the model of this name, there or not; of an OpenVINO model the .xml."""

@@ -30,8 +30,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.labels import class_labels, first_synonym, read_labels, unnamed
 from hvt_common.inference.letterbox import Preparation, as_bgr, prepared_as
-from hvt_common.inference.runtimes.first_steps import own_steps
-from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model, own_steps
 from hvt_common.inference.runtimes.model_file import is_ir
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Image, Posterior

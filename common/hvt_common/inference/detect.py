@@ -24,8 +24,7 @@ from hvt_common.inference.labels import (
 )
 from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr, prepared_as, without_palette
 from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
-from hvt_common.inference.runtimes.first_steps import own_steps
-from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model, own_steps
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
 from hvt_common.values import Detections, Image

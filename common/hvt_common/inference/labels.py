@@ -13,7 +13,7 @@ from pathlib import Path
 from hvt_common.errors import UserError, absent, telling
 from hvt_common.files import read_text
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
-from hvt_common.inference.runtimes.model_file import ir_metadata, is_ir, onnx_metadata
+from hvt_common.inference.runtimes.model_file import metadata_of
 from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, known_classes, parts_of, resolve_model
 from hvt_common.units import shown_text
@@ -264,8 +264,7 @@ def _metadata(spec: str, *, role: str) -> dict[str, str]:
     if role == "detector" and (spec == MOTION or plug_in_of(spec) is not None):
         return {}
     words = (MOTION, *plug_in_names()) if role == "detector" else ()
-    path = resolve_model(spec, role=role, words=words)
-    return ir_metadata(path) if is_ir(path) else onnx_metadata(path)
+    return metadata_of(resolve_model(spec, role=role, words=words))
 
 
 def uncalibrated(role: str, spec: str) -> str:

@@ -4,15 +4,20 @@ The embedded models come with the package: trained in this repository, Apache-2.
 library is an extra: the entry points of the group ``hvt.models``.
 """
 
+from __future__ import annotations
+
 import difflib
 import os
 from collections.abc import Collection, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from hvt_common.errors import UserError, absent, named_path
 from hvt_common.runtime.plug_ins import installed, loaded
+
+if TYPE_CHECKING:
+    from hvt_common.inference.letterbox import OwnSteps
 
 EMBEDDED_DETECTOR = "aerial-nano"
 """Finds vehicles and people from straight above or aslant."""
@@ -41,6 +46,9 @@ class ModelStore(Protocol):
     def known_classes(self, path: Path) -> str:
         """The classes of a file that is pinned: ``COCO, 80``, or names; "" for others."""
 
+    def own_steps(self, path: Path) -> OwnSteps:
+        """The first steps of a checked file on its pixels."""
+
 
 def library_part(name: str) -> Any | None:
     """A part of the model library, as the entry points name it; None where it is not installed."""
@@ -56,7 +64,7 @@ def needed_part(name: str, what: str) -> Any:
     return part
 
 
-def _store() -> ModelStore | None:
+def model_store() -> ModelStore | None:
     part = library_part("store")
     return None if part is None else part()
 
@@ -70,13 +78,13 @@ def embedded_models() -> dict[str, Path]:
 
 def model_names() -> tuple[str, ...]:
     """Every name that `resolve_model` knows; of fetched models too, whether they are here or not."""
-    store = _store()
+    store = model_store()
     return (*embedded_models(), *(() if store is None else store.entries))
 
 
 def known_classes(path: Path) -> str:
     """The classes of a file as the library that pins it says: ``COCO, 80``, or names; "" for others."""
-    store = _store()
+    store = model_store()
     return "" if store is None else store.known_classes(path)
 
 
@@ -117,7 +125,7 @@ def resolve_model(spec: str, *, role: str = "model", words: Sequence[str] = ()) 
     embedded = embedded_models()
     if spec in embedded:
         return embedded[spec]
-    store = _store()
+    store = model_store()
     if store is not None and spec in store.entries:
         return store.verified(spec)
     if (path := named_path(spec, name=role)).is_file():

@@ -16,7 +16,7 @@ from hvt_common.inference.letterbox import Letterbox, Letterboxer, Preparation, 
 from hvt_common.inference.nms import MAX_CANDIDATES, MAX_DETECTIONS, suppress
 from hvt_common.inference.runtimes.model import open_model
 from hvt_common.values import Image
-from hvt_models.forms import Dense, Listed, PerQuery
+from hvt_models.exports.forms import Dense, Listed, PerQuery
 from media.head_models import family_model
 from media.onnx_models import (
     STRIDES,

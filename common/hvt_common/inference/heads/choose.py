@@ -13,7 +13,6 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.heads.contract import (
-    MOST_RELATIVE,
     Array,
     Decoder,
     Head,
@@ -28,9 +27,6 @@ if TYPE_CHECKING:  # the runtimes take a while to import, and a list of heads ne
     from hvt_common.inference.runtimes.model import Port
 
 _BLOCK_PX = 32
-_PADDING = -1
-_SCORE, _ANGLE = 0.05, 0.2
-"""On a grey picture the mean over all cells of a class is below the one, that of an angle above the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,36 +61,6 @@ class Trial:
             [one.astype(np.float32).reshape(math.prod(one.shape[:-1]), columns) for one in answers]
         )
 
-    def numbers(self, index: int) -> Array:
-        """(N,) all numbers of an output of all pictures."""
-        return np.concatenate([run[index].astype(np.float32).ravel() for run in self.runs])
-
-    def named(self, *words: str) -> tuple[int, ...]:
-        """The one output whose name is, or has, each word, in their order; () where one has none, or several."""
-        names = [port.name.lower().partition(":")[0] for port in self.ports]
-        found = [
-            [index for index, name in enumerate(names) if name == word]
-            or [index for index, name in enumerate(names) if word in name]
-            for word in words
-        ]
-        return tuple(one[0] for one in found) if all(len(one) == 1 for one in found) else ()
-
-    def whole(self, index: int) -> bool:
-        """Whether an output has whole numbers by its type."""
-        dtype = self.ports[index].dtype
-        return dtype is not None and bool(np.issubdtype(dtype, np.integer))
-
-    def has_angles(self, index: int, first: int, *, transposed: bool = False) -> bool:
-        """Whether the last column is no class as those from ``first`` on: on grey it alone has numbers."""
-        grey = self.runs[0][index].astype(np.float32).reshape(self.runs[0][index].shape[-2:])
-        means = (grey.T if transposed else grey)[:, first:].mean(axis=0)
-        return bool(len(means) > 1 and means[-1] > _ANGLE > _SCORE > means[:-1].max())
-
-    def relative(self, boxes: Array) -> bool:
-        """Whether there are boxes, and all are shares of the input."""
-        size = float(np.abs(boxes).max(initial=0))
-        return 0 < size <= MOST_RELATIVE
-
 
 def trial_pictures(size: tuple[int, int], dtype: np.dtype[Any]) -> list[tuple[npt.NDArray[Any], int]]:
     """(1, 3, height, width) inputs: grey, and coloured blocks in both ranges that networks take, 0…1 and 0…255.
@@ -118,20 +84,6 @@ def anchor_count(input_size: tuple[int, int], strides: Sequence[int]) -> int:
 def are_probabilities(scores: Array) -> bool:
     """Whether all lie in 0…1, give or take the rounding of half precision."""
     return bool(np.isfinite(scores).all() and ((scores >= -0.01) & (scores <= 1.01)).all())
-
-
-def are_scores(numbers: Array) -> bool:
-    """Whether they are probabilities, or -1 as behind the end of a list."""
-    return are_probabilities(numbers[numbers != _PADDING])
-
-
-def are_whole(numbers: Array) -> bool:
-    """Whether all are whole numbers from -1 on, as classes are, and the padding behind them."""
-    return bool(
-        np.isfinite(numbers).all()
-        and (numbers >= -1.001).all()
-        and (abs(numbers - numbers.round()) < 1e-3).all()
-    )
 
 
 STRIDES: tuple[tuple[int, ...], ...] = (

@@ -6,7 +6,7 @@ is here, as the embedded detector writes it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -83,12 +83,6 @@ def is_like(shape: tuple[int, ...], other: tuple[int, ...]) -> bool:
     return len(shape) == len(other) and sum(a != b for a, b in zip(shape, other, strict=True)) <= 1
 
 
-MOST_RELATIVE = 1.5
-"""Boxes up to here are shares of the input: those of networks end at 1, or a little beyond."""
-
-Form = Literal["centre", "corners", "corners-yx"]
-"""Centre x, y, width, height; x1 y1 x2 y2; or y1 x1 y2 x2 as TensorFlow writes it."""
-
 _MAX_LOG_SIZE = 20.0  # e^20 strides: far outside every image, and still finite in float32
 _MOST_CLASSES = 1e6
 _MOST_SCORE = 1.01  # half precision rounds
@@ -149,14 +143,6 @@ def best(scores: Array, objectness: Array | None) -> tuple[Array, npt.NDArray[np
     class_ids = scores.argmax(axis=1) if scores.shape[1] else np.zeros(len(scores), np.intp)
     best = scores[np.arange(len(scores)), class_ids]
     return (best if objectness is None else best * objectness), class_ids
-
-
-def corners(boxes: Array, form: Form) -> Boxes:
-    """(N, 4) x1 y1 x2 y2 of boxes in that form."""
-    if form == "centre":
-        half = boxes[:, 2:] / 2
-        return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
-    return boxes[:, [1, 0, 3, 2]] if form == "corners-yx" else boxes
 
 
 def valid(

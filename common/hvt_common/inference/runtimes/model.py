@@ -11,9 +11,8 @@ from __future__ import annotations
 import logging
 import math
 import re
-import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -23,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.inference.letterbox import OwnSteps
 from hvt_common.inference.runtimes.model_file import (
     check_onnx_file,
-    ir_metadata,
     is_ir,
     onnx_version,
     opset_versions,
@@ -36,7 +35,7 @@ from hvt_common.inference.runtimes.providers import (
     ProviderChoice,
     choose_provider,
 )
-from hvt_common.inference.store import library_part, needed_part
+from hvt_common.inference.store import library_part, model_store, needed_part
 
 if TYPE_CHECKING:
     import onnxruntime as ort
@@ -50,9 +49,6 @@ _MOST_ELEMENTS = 1 << 26
 
 _MOST_CHARS = 300
 _ARENA_BYTES = 128 << 20
-_TRIAL_SIDE = 256
-_TRIALS = 5
-_WORTH_SHARE = 0.8
 LIGHT_BYTES = 8_000_000
 """A smaller file is a light network: the embedded ones, YOLOX-nano. OpenVINO alone takes more memory than it."""
 
@@ -176,13 +172,14 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     """
     settings = settings or ModelSettings()
     if is_ir(path):
-        return _open_ir(path, settings)
+        return cast("OnnxModel", needed_part("openvino", f"model {path}").open_ir(path, settings))
     choice = provider_here(settings.provider, light=path.is_file() and path.stat().st_size < LIGHT_BYTES)
     check_onnx_file(path)
     try:
         model = _open(path, settings, choice)
         if choice.provider == "openvino" and not choice.explicit and len(model.inputs) == 1:
-            model = _quicker(model, path, settings)
+            plain = _open(path, settings, ProviderChoice("cpu", "", explicit=False))
+            model = cast("OnnxModel", needed_part("openvino", f"model {path}").quicker(model, plain))
     except UserError as error:
         if choice.explicit or choice.provider == "cpu":
             raise
@@ -205,65 +202,13 @@ def find_openvino() -> OpenVinoCpu | None:
     return None if part is None else cast("OpenVinoCpu | None", part.find())
 
 
-def _on_openvino(path: Path, settings: ModelSettings, *, bf16: bool) -> Any:
-    return needed_part("openvino", f"model {path}")(path, threads=settings.threads, bf16=bf16)
-
-
-def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
-    # An OpenVINO model, in float32 where the reference is requested.
-    if settings.provider not in ("auto", "cpu", "openvino"):
-        raise UserError(
-            f"model {path} is OpenVINO's: --provider {settings.provider} cannot run it; openvino can"
-        )
-    metadata = ir_metadata(path)
-    found = find_openvino()
-    if found is None:
-        raise UserError(
-            f"model {path} is OpenVINO's, which is not installed here: pip install 'hvt[openvino]'"
-        )
-    bf16 = found.bf16 and settings.provider != "cpu"
-    openvino = _on_openvino(path, settings, bf16=bf16)
-    inputs, outputs = (tuple(Port(*port) for port in ports) for ports in openvino.ports)
-    why = f"OpenVINO {found.version} in {'bf16' if bf16 else 'float32'}: the file is OpenVINO's"
-    choice = ProviderChoice("openvino", why, explicit=True)
-    _check_ports(path, inputs, outputs)
-    _log.info("%s runs on openvino: %s", path.name, why)
-    return OnnxModel(path, inputs, outputs, metadata=metadata, runner=openvino, provider=choice)
-
-
-def _quicker(openvino: OnnxModel, path: Path, settings: ModelSettings) -> OnnxModel:
-    # On cpu where that is about as quick. No table could tell: bf16 takes 2/3 of the time here, 3/2 there.
-    plain = _open(path, settings, ProviderChoice("cpu", "", explicit=False))
-    shape = [
-        size or free
-        for size, free in zip(plain.inputs[0].shape, (1, 3, _TRIAL_SIDE, _TRIAL_SIDE), strict=False)
-    ]
-    feed = np.zeros(shape, plain.inputs[0].dtype or np.float32)
-    share = min(_seconds(openvino, feed)) / min(_seconds(plain, feed))
-    version = openvino.provider.why.partition(" is installed")[0]
-    if share < _WORTH_SHARE:
-        why = f"{version} in bf16 takes {share:.0%} of onnxruntime's time here"
-        openvino.provider = replace(openvino.provider, why=why)
-        return openvino
-    plain.provider = replace(plain.provider, why=f"{version} takes {share:.0%} of its time here")
-    return plain
-
-
-def _seconds(model: OnnxModel, feed: npt.NDArray[Any]) -> Iterator[float]:
-    # The time of each of some runs, after one that may compile.
-    model.run(feed)
-    for _ in range(_TRIALS):
-        began_s = time.perf_counter()
-        model.run(feed)
-        yield time.perf_counter() - began_s
-
-
 def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxModel:
     runner: _Runner
     if choice.provider == "openvino":
         session = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()
-        runner = _on_openvino(path, settings, bf16=found is not None and found.bf16)
+        bf16 = found is not None and found.bf16
+        runner = needed_part("openvino", f"model {path}")(path, threads=settings.threads, bf16=bf16)
     else:
         names = ONNXRUNTIME_PROVIDERS[choice.provider]
         session = _session(path, settings, names)
@@ -275,6 +220,12 @@ def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxMo
     inputs, outputs = _ports(session)
     metadata = session.get_modelmeta().custom_metadata_map
     return OnnxModel(path, inputs, outputs, metadata=metadata, runner=runner, provider=choice)
+
+
+def own_steps(path: Path) -> OwnSteps:
+    """The first steps on its pixels of a checked file, as the model library reads them; most have none."""
+    store = model_store()
+    return OwnSteps() if store is None else store.own_steps(path)
 
 
 def _ports(session: ort.InferenceSession) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
@@ -314,11 +265,12 @@ def _session(
                 f"model {path} has {value.name!r:.40}, a {value.type:.80}; tensors are accepted: export it without"
                 " ZipMap, or without lists"
             )
-    _check_ports(path, *_ports(session))
+    check_ports(path, *_ports(session))
     return session
 
 
-def _check_ports(path: Path, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:
+def check_ports(path: Path, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:
+    """Raise `UserError` for more ports, axes or numbers than are accepted."""
     for side, ports in (("inputs", inputs), ("outputs", outputs)):
         if not 1 <= len(ports) <= _MOST_PORTS:
             raise UserError(f"model {path} has {len(ports)} {side}; 1 to {_MOST_PORTS} are accepted")

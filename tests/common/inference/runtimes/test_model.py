@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes import model_file
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from hvt_common.inference.runtimes.model_file import MAX_MODEL_BYTES, ir_metadata
+from hvt_common.inference.runtimes.model_file import MAX_MODEL_BYTES, metadata_of
 from hvt_common.runtime.process import with_lower_priority
 from media.onnx_models import colour_detector, constant_model
 from programs.processes import python
@@ -173,7 +173,7 @@ def test_an_openvino_model_needs_its_weights_and_its_runtime(tmp_path, monkeypat
         open_model(path)
     with pytest.raises(UserError, match="--provider cuda cannot run it"):
         open_model(path, settings=ModelSettings(provider="cuda"))
-    monkeypatch.setattr("hvt_common.inference.runtimes.model.find_openvino", lambda: None)
+    monkeypatch.setattr("hvt_models.openvino.find_openvino", lambda: None)
     with pytest.raises(UserError, match=r"pip install 'hvt\[openvino\]'"):
         open_model(path)
     path.write_text("<?xml version='1.0'?><!DOCTYPE net [<!ENTITY a 'b'>]><net></net>")
@@ -358,7 +358,7 @@ def test_an_openvino_model_says_its_pixels(tmp_path, said, expected):
     """A network of Geti or DL Streamer would get other pixels than it was trained with, and find little."""
     (tmp_path / "m.bin").write_bytes(b"")
     (tmp_path / "m.xml").write_text(f"<net><rt_info><model_info>{said}</model_info></rt_info></net>")
-    found = ir_metadata(tmp_path / "m.xml")
+    found = metadata_of(tmp_path / "m.xml")
     assert {key: value for key, value in found.items() if key.startswith("hvt.")} == expected
 
 

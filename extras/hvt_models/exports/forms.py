@@ -7,20 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from hvt_common.inference.heads.contract import (
-    MOST_RELATIVE,
-    Array,
-    Form,
-    HeadOutput,
-    best,
-    corners,
-    rows_of,
-    valid,
-)
+from hvt_common.inference.heads.contract import Array, HeadOutput, best, rows_of, valid
 from hvt_common.values import Boxes
+
+MOST_RELATIVE = 1.5
+"""Boxes up to here are shares of the input: those of networks end at 1, or a little beyond."""
+
+Form = Literal["centre", "corners", "corners-yx"]
+"""Centre x, y, width, height; x1 y1 x2 y2; or y1 x1 y2 x2 as TensorFlow writes it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +37,7 @@ class Dense:
         sure = table[4] if self.objectness else table[4:].max(axis=0, initial=0)
         picked = table[:, np.flatnonzero(sure >= confidence)].T
         scores, class_ids = best(picked[:, first:], picked[:, 4] if self.objectness else None)
-        boxes = _pixels(corners(picked[:, :4], "centre"), input_size)
+        boxes = _pixels(_corners(picked[:, :4], "centre"), input_size)
         return valid(boxes, scores, class_ids, confidence)
 
 
@@ -62,7 +60,7 @@ class Listed:
         if self.image is not None:
             table = table[: np.argmax(np.append(table[:, self.image] < 0, True))]
         picked = table[table[:, self.score] >= confidence]
-        boxes = _pixels(corners(picked[:, self.box : self.box + 4], self.form), input_size)
+        boxes = _pixels(_corners(picked[:, self.box : self.box + 4], self.form), input_size)
         return valid(boxes, picked[:, self.score], picked[:, self.kind], confidence)
 
 
@@ -82,7 +80,7 @@ class Parallel:
         if len(outputs) > 3 and outputs[3].size and np.isfinite(outputs[3].flat[0]):
             count = min(count, max(0, int(outputs[3].flat[0])))
         picked = np.flatnonzero(scores[:count] >= confidence)
-        pixels = _pixels(corners(boxes[picked], self.form), input_size)
+        pixels = _pixels(_corners(boxes[picked], self.form), input_size)
         return valid(pixels, scores[picked], kinds[picked] - self.first_class, confidence)
 
 
@@ -103,7 +101,7 @@ class PerQuery:
             table = np.where(table == np.inf, table, sure).astype(np.float32)
         picked = np.flatnonzero(table.max(axis=1, initial=0) >= confidence)
         scores, class_ids = best(table[picked], None)
-        pixels = _pixels(corners(boxes[picked], self.form), input_size)
+        pixels = _pixels(_corners(boxes[picked], self.form), input_size)
         return valid(pixels, scores, class_ids, confidence)
 
 
@@ -127,3 +125,11 @@ def _pixels(boxes: Boxes, input_size: tuple[int, int]) -> Boxes:
     if len(finite) and np.abs(finite).max() <= MOST_RELATIVE:
         return boxes * np.array([*input_size, *input_size], np.float32)
     return boxes
+
+
+def _corners(boxes: Array, form: Form) -> Boxes:
+    # (N, 4) x1 y1 x2 y2 of boxes in that form.
+    if form == "centre":
+        half = boxes[:, 2:] / 2
+        return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
+    return boxes[:, [1, 0, 3, 2]] if form == "corners-yx" else boxes
