@@ -1,12 +1,14 @@
 """A serial link, message by message, against sums done by hand."""
 
+import math
 from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_study.flights.flight_link import LinkReport, SerialLink
+from hvt_study.flights.flight import picture_age_p95_ms
+from hvt_study.flights.flight_link import START_NS, LinkReport, SerialLink, frame_ns
 
 MS = 1_000_000
 
@@ -80,7 +82,10 @@ def test_report():
     report = LinkReport.of([one.arrival_ns - one.enter_ns for one in there], there)
     assert (report.delay_p50_ms, report.delay_p95_ms) == (150, pytest.approx(195))  # 100, 150, 200
     assert report.worst_queue_bytes == 2000  # the first is there just as the third comes
-    assert LinkReport.of([], []).worst_queue_bytes == 0
+    none = LinkReport.of([], [])
+    assert none.worst_queue_bytes == 0
+    unknown = (none.delay_p50_ms, none.delay_p95_ms, picture_age_p95_ms([(frame_ns(9), START_NS)], 9))
+    assert all(map(math.isnan, unknown))  # 0 ms would be the best of all
 
 
 def test_a_rate_of_nothing_is_refused():

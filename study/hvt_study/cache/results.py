@@ -35,7 +35,7 @@ def flight_code() -> str:
 
 @cache
 def code_digest(*packages: str, without: tuple[str, ...] = ()) -> str:
-    """Digest of the Python files of these packages, as they are installed here; a process reads them once.
+    """Digest of the files of these packages, as they are installed here; a process reads them once.
 
     A checkout and a wheel with the same files have the same digest. ``without`` names folders that are passed over.
     """
@@ -43,16 +43,16 @@ def code_digest(*packages: str, without: tuple[str, ...] = ()) -> str:
 
 
 def tree_digest(folders: Iterable[Path], *, without: Collection[str] = ()) -> str:
-    """Hexadecimal; of the names and contents of all Python files below, in whatever order a disk lists them.
+    """Hexadecimal; of the names and contents of all files below, in whatever order a disk lists them.
 
-    ``without`` names folders as `code_digest` does: from the last part of one of ``folders`` on.
+    Tables of class names decide figures as code does; bytecode and hidden files are left out. ``without`` names folders as `code_digest` does: from the last part of one of ``folders`` on.
     """
     digest = hashlib.sha256()
     files = {
         file.relative_to(folder.parent).as_posix(): file
         for folder in folders
-        for file in folder.rglob("*.py")
-        if file.is_file()
+        for file in folder.rglob("[!.]*")
+        if file.is_file() and file.parent.name != "__pycache__"
     }
     for name, file in sorted(files.items()):
         if any(name.startswith(f"{folder}/") for folder in without):

@@ -130,7 +130,7 @@ def _held(row: CompareRow) -> tuple[str, ...]:
 
 
 def _pace(row: CompareRow) -> tuple[str, ...]:
-    return f"{row['fps']:.1f}", f"{row['delay_p95_ms']:.0f}", f"{row['edge_cpu_ms']:.0f}"
+    return f"{row['fps']:.1f}", output.decimals(row["delay_p95_ms"], 0), f"{row['edge_cpu_ms']:.0f}"
 
 
 def _plan(arguments: argparse.Namespace) -> ComparePlan:

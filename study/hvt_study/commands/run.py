@@ -2,8 +2,11 @@
 
 import argparse
 import logging
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from filelock import FileLock
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
@@ -41,7 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
     rows = _flown(plan, arguments, table)
     others = _write(rows, arguments, table)
     _add_example(rows, plan, arguments.out)
-    write_report(arguments.out)
+    with _alone(arguments.out):
+        write_report(arguments.out)
     failed = [row for row in rows if row["failed"]]
     if len(failed) == len(rows):
         raise UserError(f"every run failed, the first: {_failure(failed[0])}")
@@ -68,10 +72,17 @@ def _earlier(table: Path) -> list[RunRow]:
 
 def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> int:
     """Write them, and behind them the remaining rows of the present table; returns the number of those."""
-    others = staying(rows, _earlier(table))
-    with writing(arguments.out):
+    with _alone(arguments.out):
+        others = staying(rows, _earlier(table))
         write_results(in_accounting([*rows, *others], arguments.accounting), table)
     return len(others)
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Of two studies that write into one folder each adds to the other's rows."""
+    with writing(out), FileLock(out / ".lock"):
+        yield
 
 
 def _flown(plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> list[RunRow]:

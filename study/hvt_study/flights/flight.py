@@ -98,12 +98,15 @@ def coded_frames(frames: int, fps: float) -> frozenset[int]:
 
 
 def picture_age_p95_ms(shown_ns: Sequence[tuple[int, int]], frames: int) -> float:
-    """Age of the newest of the pictures, (arrival, capture), at each of ``frames`` from the first picture on."""
+    """Age of the newest of the pictures, (arrival, capture), at each of ``frames`` from the first picture on.
+
+    NaN where none came in time.
+    """
     shown = np.array(shown_ns, np.int64).reshape(-1, 2)
     at_ns = np.array([flight_link.frame_ns(frame_index) for frame_index in range(frames)], np.int64)
     at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]
     newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
-    return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else 0.0
+    return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else math.nan
 
 
 def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport:

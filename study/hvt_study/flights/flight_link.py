@@ -8,6 +8,7 @@ bytes, as the ledger counts them. Pure: time is an argument.
 from __future__ import annotations
 
 import hashlib
+import math
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -53,7 +54,7 @@ class Arrival(Generic[_T]):
 
 @dataclass(frozen=True, slots=True)
 class LinkReport:
-    """How long messages took."""
+    """How long messages took; NaN where none did."""
 
     delay_p50_ms: float
     """From the reference time that was given for each to its arrival."""
@@ -65,7 +66,7 @@ class LinkReport:
     def of(cls, delays_ns: Iterable[int], arrivals: Iterable[Arrival[_T]]) -> LinkReport:
         """``delays_ns`` of the messages that matter; the queue is that of all ``arrivals``."""
         delays_ms = np.fromiter(delays_ns, np.float64) / 1e6
-        p50, p95 = np.percentile(delays_ms, (50, 95)).tolist() if len(delays_ms) else (0.0, 0.0)
+        p50, p95 = np.percentile(delays_ms, (50, 95)).tolist() if len(delays_ms) else (math.nan, math.nan)
         return cls(delay_p50_ms=p50, delay_p95_ms=p95, worst_queue_bytes=_worst_queue(arrivals))
 
 

@@ -5,10 +5,15 @@ import multiprocessing
 import os
 import signal
 import threading
+import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
-from typing import ParamSpec, TypeVar
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from multiprocessing.resource_tracker import ensure_running
+from typing import ParamSpec, TypeVar, cast
 
 import cv2
 
@@ -28,13 +33,11 @@ def local_pool(jobs: int) -> Iterator[Executor]:
 
     Raises `UserError` where a process was killed.
     """
-    # Fresh processes: a fork would share threads and locks of open files and models.
-    context = multiprocessing.get_context("spawn")
-    pool = _Processes(jobs, mp_context=context, initializer=_prepare)
+    pool = _Processes(jobs)
     try:
         yield pool
     except BaseException as error:
-        _end(pool)
+        pool.end()
         if isinstance(error, BrokenExecutor):
             raise UserError(
                 f"a process of the study was killed, perhaps for want of memory (lower --jobs): {_GOES_ON}"
@@ -42,6 +45,7 @@ def local_pool(jobs: int) -> Iterator[Executor]:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+        pool.close()
 
 
 @contextmanager
@@ -77,16 +81,68 @@ def dask_pool(address: str) -> Iterator[Executor]:
             pool.shutdown(wait=False)
 
 
-class _Processes(ProcessPoolExecutor):
-    """Starts its processes deaf to Ctrl-C: one that is still being imported would answer it with a traceback."""
+class _Processes(ThreadPoolExecutor):
+    """A process for each thread, which hands it work through a pipe and waits.
+
+    `ProcessPoolExecutor` has semaphores with names in the system, which stay there where all is killed at once.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        # Fresh processes: a fork would share threads and locks of open files and models.
+        self._context = multiprocessing.get_context("spawn")
+        self._here = threading.local()
+        self._each: list[tuple[BaseProcess, Connection]] = []
+        self._ended = False
+        super().__init__(jobs, initializer=self._start)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        # Blocked signals are inherited; here they are only late.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        return super().submit(self._there, partial(fn, *args, **kwargs))
+
+    def end(self) -> None:
+        """Let go of running work."""
+        self._ended = True
+        for process, _ in list(self._each):
+            process.terminate()
+
+    def close(self) -> None:
+        """Let idle processes end in peace."""
+        for process, pipe in self._each:
+            pipe.close()
+            process.join()
+
+    def _start(self) -> None:
+        ensure_running()  # which unblocks what follows
+        # Blocked signals are inherited: one that is still being imported would answer Ctrl-C with a traceback.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        self._here.pipe, there = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(there,), daemon=True)
+        process.start()
+        there.close()
+        self._each.append((process, self._here.pipe))
+
+    def _there(self, work: Callable[[], R]) -> R:
         try:
-            return super().submit(fn, *args, **kwargs)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            if self._ended:
+                raise EOFError
+            self._here.pipe.send(work)
+            done, found = self._here.pipe.recv()
+        except (EOFError, OSError):
+            raise BrokenExecutor from None
+        if done:
+            return cast("R", found)
+        raise found
+
+
+def _serve(pipe: Connection) -> None:
+    _prepare()
+    with suppress(EOFError):
+        while work := pipe.recv():
+            try:
+                answer = True, work()
+            except Exception as error:  # noqa: BLE001 - it is raised in the process that asked
+                error.add_note(traceback.format_exc())
+                answer = False, error
+            pipe.send(answer)
 
 
 def _prepare() -> None:
@@ -102,12 +158,6 @@ def _end_with_parent() -> None:
     assert parent is not None, "it was started by one"
     parent.join()
     os._exit(1)
-
-
-def _end(pool: ProcessPoolExecutor) -> None:
-    """Let go of running work; Python 3.14 has `terminate_workers` for it."""
-    for process in list((pool._processes or {}).values()):  # noqa: SLF001
-        process.terminate()
 
 
 def _first_line(error: BaseException) -> str:

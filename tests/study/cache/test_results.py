@@ -101,7 +101,14 @@ def test_an_edit_is_another_code(tmp_path):
     own = tree_digest([before])
     assert tree_digest([package(tmp_path / "copy")]) == own
     page = package(tmp_path / "page", page="b")
-    edits = (package(tmp_path / "edit", tracker="iou = 0.4\n"), package(tmp_path / "more", other=""), page)
+    named = package(tmp_path / "named")
+    (named / "kinds.toml").write_text('van = "car"\n')  # classes would be compared by the old table
+    edits = (
+        package(tmp_path / "edit", tracker="iou = 0.4\n"),
+        package(tmp_path / "more", other=""),
+        page,
+        named,
+    )
     assert own not in [tree_digest([edit]) for edit in edits]
     (before / "__pycache__").mkdir()
     shutil.copy(before / "tracker.py", before / "__pycache__" / "tracker.pyc")

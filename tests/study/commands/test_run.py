@@ -6,6 +6,7 @@ import signal
 
 import numpy as np
 import pytest
+from filelock import FileLock, Timeout
 
 from hvt_study.cli import main
 from hvt_study.commands import run as command
@@ -136,7 +137,13 @@ def test_a_study_beside_another_in_one_folder_keeps_its_rows(scene, done, tmp_pa
         write_results(other, tmp_path / "results.parquet")  # ended in the meantime
         return own
 
+    def written(rows, path):
+        with pytest.raises(Timeout):  # from reading to writing nobody else does
+            FileLock(tmp_path / ".lock").acquire(blocking=False)
+        write_results(rows, path)
+
     monkeypatch.setattr(command, "run_all", flown)
+    monkeypatch.setattr(command, "write_results", written)
     words = arguments(scene, tmp_path, "--methods", "M0", "--regimes", REGIME, "--jobs", "1")
     assert main(["run", *words]) == 0
     assert {row["key"] for row in table(tmp_path)} == {row["key"] for row in (*own, *other)}
