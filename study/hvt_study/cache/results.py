@@ -45,7 +45,8 @@ def code_digest(*packages: str, without: tuple[str, ...] = ()) -> str:
 def tree_digest(folders: Iterable[Path], *, without: Collection[str] = ()) -> str:
     """Hexadecimal; of the names and contents of all files below, in whatever order a disk lists them.
 
-    Tables of class names decide figures as code does; bytecode and hidden files are left out. ``without`` names folders as `code_digest` does: from the last part of one of ``folders`` on.
+    Tables of class names decide figures as code does; bytecode and hidden files are left out. ``without`` names
+    folders as `code_digest` does: from the last part of one of ``folders`` on.
     """
     digest = hashlib.sha256()
     files = {

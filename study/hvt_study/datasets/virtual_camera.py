@@ -28,7 +28,14 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
-from hvt_study.datasets.label_files import class_file, keypoint_columns, read_image, read_yolo, yolo_names
+from hvt_study.datasets.label_files import (
+    class_file,
+    in_any_case,
+    keypoint_columns,
+    read_image,
+    read_yolo,
+    yolo_names,
+)
 from hvt_study.datasets.label_table import image_labels
 from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
 
@@ -89,11 +96,12 @@ class _Way:
 
 def annotation_file(picture: Path) -> Path:
     """Where the annotations of a picture are, or would be."""
-    beside = picture.with_suffix(".txt")
-    if picture.parent.name != "images" or beside.is_file():
+    beside = in_any_case(picture.with_suffix(".txt"))
+    if picture.parent.name.lower() != "images" or beside.is_file():
         return beside
-    yolo = picture.parent.parent / _YOLO / beside.name
-    return yolo if yolo.is_file() else picture.parent.parent / "annotations" / beside.name
+    root, name = picture.parent.parent, beside.name
+    yolo = in_any_case(root / _YOLO / name)
+    return yolo if yolo.is_file() else in_any_case(root / "annotations" / name)
 
 
 def read_annotations(
@@ -104,7 +112,7 @@ def read_annotations(
     ``classes`` are names of YOLO's; none: those of ``classes.txt`` beside its folder. Wrong rows are left out;
     `UserError` where all are.
     """
-    if path.parent.name != _YOLO:
+    if path.parent.name.lower() != _YOLO:
         return image_labels(path, size), tuple(sorted(VISDRONE_NAMES))
     root = path.parent.parent
     names = yolo_names(root, tuple(classes) or None)

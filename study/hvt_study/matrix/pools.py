@@ -121,9 +121,9 @@ class _Processes(ThreadPoolExecutor):
         self._each.append((process, self._here.pipe))
 
     def _there(self, work: Callable[[], R]) -> R:
+        if self._ended:
+            raise BrokenExecutor
         try:
-            if self._ended:
-                raise EOFError
             self._here.pipe.send(work)
             done, found = self._here.pipe.recv()
         except (EOFError, OSError):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_edge.source.folder import sequence_files
+from hvt_study.datasets.label_files import in_any_case
 from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.image_sequence import find_folders
@@ -43,7 +44,8 @@ def open_stills(place: Path, options: Options) -> Mapping[str, Callable[[], Sequ
 
 
 def _pictures(place: Path) -> list[Path]:
-    folders = [folder / "images" for folder in find_folders(place, depth=1) if (folder / "images").is_dir()]
+    inner = (in_any_case(folder / "images") for folder in find_folders(place, depth=1))
+    folders = [one for one in inner if one.is_dir()]
     found = [file for folder in folders or [place] for file in sequence_files(folder)]
     if not found:
         raise UserError(
