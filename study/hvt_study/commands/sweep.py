@@ -49,6 +49,7 @@ class SweepRow:
 
 
 def sweep(frames: Mapping[int, RawDetections], *, frame_area_px: float) -> list[SweepRow]:
+    """A row a selector; there is a raw detection at least."""
     raw = sum(len(found.confidences) for found in frames.values())
     with_raw = sum(1 for found in frames.values() if found.confidences)
     rows = []
@@ -58,7 +59,7 @@ def sweep(frames: Mapping[int, RawDetections], *, frame_area_px: float) -> list[
             for found in frames.values()
         ]
         selected, covered = sum(counts), sum(1 for count in counts if count)
-        rows.append(SweepRow(selector.name, selected, selected / max(1, raw), covered / max(1, with_raw)))
+        rows.append(SweepRow(selector.name, selected, selected / raw, covered / with_raw))
     return rows
 
 
@@ -144,6 +145,8 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         frames, area = _from_clip(arguments)
     raw = sum(len(found.confidences) for found in frames.values())
+    if not raw:
+        raise UserError(f"{arguments.source} has no raw detections: a share of them is selected")
     rows = sweep(frames, frame_area_px=area)
     cells = ((row.policy, str(row.selected), f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}") for row in rows)
     print_columns(f"{raw} raw detections on {len(frames)} frames", COLUMNS, cells, words=("policy",))

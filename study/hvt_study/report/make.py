@@ -48,9 +48,12 @@ def answer(found: Sequence[Setting]) -> Iterator[str | Drawing]:
             continue
         best = max(plain, key=lambda pair: pair.interval(DECIDES).mean)
         ahead = " ".join(filter(None, written(best.interval(DECIDES), metric, sign=True)))
+        first = "The method furthest ahead of video at the same bits"
+        if not best.interval(DECIDES).mean > 0:
+            first = "No method is ahead of video at the same bits; the nearest"
         yield (
-            f"{setting.name}, labels: {setting.labels}. The method furthest ahead of video at the same bits is "
-            f"{best.arm.name} in the {best.arm.regime} regime, {ahead} {metric.title} "
+            f"{setting.name}, labels: {setting.labels}. {first} is {best.arm.name} in the {best.arm.regime} regime, "
+            f"{ahead} {metric.title} "
             f"(n = {len(best.gaps(DECIDES))}). {_tally(plain)}"
         )
     for setting in found[:1]:

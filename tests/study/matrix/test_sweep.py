@@ -47,6 +47,7 @@ def test_known_answer(tmp_path, capsys):
     ("text", "said"),
     [
         ("frame,x1,y1\n0,1,2\n", "has no column x2, y2, conf, class"),
+        (DETECTIONS.partition("\n")[0], "has no raw detections"),
         (DETECTIONS + "7,0,0,nan,9,0.5,car\n", "not finite"),
         (DETECTIONS + "7,0,0,x,9,0.5,car\n", "line 8"),
         (DETECTIONS + "7,0\n", "line 8"),

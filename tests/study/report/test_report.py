@@ -153,6 +153,13 @@ def test_differences_are_of_pairs_at_matched_totals():
     assert not any(cell.strong for cell in column(table, "Δ named F1"))
 
 
+def test_who_is_behind_video_is_not_said_to_be_ahead():
+    """The first sentence of a report whose every method loses named the one "furthest ahead"."""
+    behind = [one | {"named_f1": 0.8} if one["matched_to"] else one for one in study()]
+    said = "No method is ahead of video at the same bits; the nearest is M5 jpeg in the low regime, "
+    assert said + "\N{MINUS SIGN}0.200 named F1 (n = 3)." in str(make_report(behind).sections[0].parts[0])
+
+
 def test_where_video_misses_the_bits_of_a_method_there_is_no_answer():
     """It was left out without a word, and "the totals of no pair are more than 0.00 % apart"."""
     missed = [one | {"failed": "spends less"} if one["matched_to"] else one for one in study()]

@@ -19,7 +19,7 @@ from hvt_study.report.data.pairs import EqualQuality, pairs
 from hvt_study.report.data.table_file import write_results
 from hvt_study.report.example.choice import CropExample, Example, Timeline, choose_run
 from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
-from hvt_study.report.figures.drawing import PALETTE, log_axis, style_of
+from hvt_study.report.figures.drawing import PALETTE, log_axis, rate_axis, style_of
 from hvt_study.report.figures.example_figures import crop_pictures
 from hvt_study.report.figures.pair_figures import difference_figures
 from hvt_study.report.make import make_report
@@ -364,6 +364,9 @@ def test_marks_of_an_axis_do_not_touch():
     axes.set_xlim(0.1, 10)
     log_axis(axes, (1, 2, 0.5, 5, 0.8, 1.25, 1.6))
     assert sorted(axes.get_xticks()) == [1, 5]
+    axes.set_xlim(215, 305)
+    rate_axis(axes, (300,))  # of a study at one budget
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["300", "240", "270"]
 
 
 def test_figures_of_an_earlier_report_go_and_what_is_not_ours_stays(tmp_path):

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from hvt_study.report.data.arms import Arm, BySequence, Setting, values
 from hvt_study.report.data.captions import INTERVALS, METRICS, interval_of, mean_of, under
@@ -74,7 +73,7 @@ def codec_figure(setting: Setting, *, name: str) -> Drawing | None:
                 axes.set_title(f"{METRICS[column].title}, {regime}")
                 plain_axes(axes)
         grid[0][0].set_xscale("log")
-        _size_marks(grid[0][0])
+        log_axis(grid[0][0], [step * 10**power for power in range(1, 7) for step in (1, 2, 5)])
         for axes in grid[-1]:
             axes.set_xlabel("bytes/still")
         named = {
@@ -167,13 +166,6 @@ def _draw_codecs(
 def _sizes(setting: Setting, arm: Arm) -> list[float]:
     found = values(setting.runs(arm), "mean_still_bytes").values()
     return [value for value in found if value > 0]
-
-
-def _size_marks(axes: Axes) -> None:
-    log_axis(axes, [step * 10**power for power in range(1, 7) for step in (1, 2, 5)])
-    if len(axes.get_xticks()) < 3:
-        axes.xaxis.set_major_locator(MaxNLocator(3))
-        axes.xaxis.set_major_formatter("{x:g}")
 
 
 def _budget_kbps(setting: Setting, regime: str) -> float:

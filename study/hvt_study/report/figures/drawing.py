@@ -14,6 +14,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hvt_study.matrix.compare import COMPARED, CompareResult, CompareRow
 from hvt_study.report.data.arms import Arm
@@ -122,12 +123,15 @@ def plain_axes(axes: Axes, *, grid: str = "both") -> None:
 
 
 def log_axis(axes: Axes, wanted: Iterable[float]) -> None:
-    """A logarithmic axis, marked at those of these values that lie in it and have room, earlier ones first."""
+    """A logarithmic axis, marked at those of these values that lie in it and have room, earlier ones first.
+
+    Round ones fill the gaps: one mark alone tells no scale.
+    """
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     apart = math.log(high / low) * _MARK_IN * axes.figure.dpi / axes.bbox.width
     marks: list[float] = []
-    for value in wanted:
+    for value in (*wanted, *MaxNLocator(3).tick_values(low, high)):
         if low <= value <= high and all(abs(math.log(value / one)) >= apart for one in marks):
             marks.append(value)
     axes.set_xticks(marks, [f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in marks])
