@@ -142,7 +142,7 @@ TARGETS = (
         "ground-session",
         _session,
         _seeds,
-        mutate=_changed,
+        _changed,
         share=4,
         short=100,
         most_bytes=60_000,

@@ -11,7 +11,7 @@ from hvt_common.protocol import messages as wire
 from hvt_common.protocol.channels import parse_key
 from hvt_common.values import Orientation, Pose
 from lab.fuzz.contract import Target
-from lab.fuzz.mutate import Bytes, changed_values, each_part, joined, parted, plain, with_checksum
+from lab.fuzz.mutate import Bytes, changed_parts, changed_values, joined, parted, plain, with_checksum
 from rigs import messages
 from rigs.flight import tracks_at
 
@@ -197,16 +197,8 @@ TARGETS = (
     _message("control-request", wire.ControlRequest, REQUESTS),
     _message("control-answer", wire.ControlAnswer, [messages.ANSWER]),
     _message("feedback", wire.Feedback, [feedback(), feedback(stills=(), backlog=(), missing_stills=())]),
-    Target(
-        "track-steps",
-        _track_steps,
-        _step_seeds,
-        mutate=each_part(changed_values),
-        share=60,
-        short=250,
-        most_bytes=6000,
-    ),
-    Target("pose-reports", _pose_reports, _pose_seeds, mutate=each_part(changed_values), share=40, short=500),
+    Target("track-steps", _track_steps, _step_seeds, changed_parts, share=60, short=250, most_bytes=6000),
+    Target("pose-reports", _pose_reports, _pose_seeds, changed_parts, share=40, short=500),
     Target("backlog-still", _backlog_still, _backlog_still_seeds, share=40),
     Target(
         "backlog-units",

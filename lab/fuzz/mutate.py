@@ -95,6 +95,9 @@ def changed_values(data: bytes, rng: Random, raw: Bytes) -> bytes:
         return with_checksum(raw(data[:-_CRC_BYTES]))
 
 
+changed_parts = each_part(changed_values)
+
+
 def with_checksum(body: bytes, payload: bytes = b"") -> bytes:
     """A message's bytes up to its checksum, and the checksum."""
     return body + b"\xce" + zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")

@@ -27,6 +27,7 @@ CODECS = ("jpeg", "webp", "avif", "jxl", "h264-intra", "residual")
 _SIZES = ((56, 40), (16, 16), (117, 50), (200, 9))
 _VIEW = View.fitted((640, 360), (320, 192), fit="letterbox")
 _BASE_SIZE = (96, 64)
+_STILL = each_part(changed_values, None)
 
 
 @cache
@@ -144,22 +145,8 @@ TARGETS = (
         for name in CODECS
         if name in still_codec_names()
     ),
+    Target("still-received", _received, _received_seeds, _STILL, share=20, short=400, most_bytes=40_000),
     Target(
-        "still-received",
-        _received,
-        _received_seeds,
-        mutate=each_part(changed_values, None),
-        share=20,
-        short=400,
-        most_bytes=40_000,
-    ),
-    Target(
-        "base-decoder",
-        _base_stream,
-        _base_seeds,
-        mutate=each_part(None),
-        share=15,
-        short=200,
-        most_bytes=20_000,
+        "base-decoder", _base_stream, _base_seeds, each_part(None), share=15, short=200, most_bytes=20_000
     ),
 )

@@ -13,7 +13,7 @@ from hvt_edge.link.rate_control import RateController
 from hvt_ground.link.reassemble import REORDER_UNITS, RESEND_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
-from lab.fuzz.mutate import changed_values, each_part, joined, parted
+from lab.fuzz.mutate import changed_parts, joined, parted
 from rigs.command_rig import SESSION, Rig
 
 _MS = 1_000_000
@@ -142,22 +142,6 @@ def _report_seeds() -> list[bytes]:
 
 TARGETS = (
     Target("reassembly", _reassembly, _reassembly_seeds, share=60, short=1500, most_bytes=_STEP.size * 60),
-    Target(
-        "commands",
-        _commands,
-        _command_seeds,
-        mutate=each_part(changed_values),
-        share=30,
-        short=1500,
-        most_bytes=3000,
-    ),
-    Target(
-        "reports",
-        _reports,
-        _report_seeds,
-        mutate=each_part(changed_values),
-        share=20,
-        short=600,
-        most_bytes=6000,
-    ),
+    Target("commands", _commands, _command_seeds, changed_parts, share=30, short=1500, most_bytes=3000),
+    Target("reports", _reports, _report_seeds, changed_parts, share=20, short=600, most_bytes=6000),
 )

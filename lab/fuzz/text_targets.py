@@ -131,59 +131,24 @@ _GROUND_LINES = (
     b"--listen\0tcp/127.0.0.1:7447\0--edges\0uav-*\0--once",
     b"--detector\0motion\0--classifier\0none\0--record\0a.rrd",
 )
+_EDGE = _command_line(EdgeConfig, check_edge)
+_GROUND = _command_line(GroundConfig, lambda _settings: None)
+_UNITS = (b"800kbps", b"0.8 Mbit/s", b"200MB", b"2.5s", b"1280x720", b"81.25%", b"uav-*")
+_SETTINGS = (
+    b'budget = "800kbps"\nsize = "640x360"\nconnect = ["tcp/127.0.0.1:7447"]\n',
+    b"once = true\n",
+)
+_ENDPOINTS = (b"tcp/127.0.0.1:7447", b"tls/[::1]:1?a=b#c=d")
+_NAMES = (b"{0: 'car', 1: 'bus'}", b'["car", "bus"]', b"car\nbus\n", b"((1, 2), {3: -4})")
 
 TARGETS = (
-    Target(
-        "units",
-        _units,
-        lambda: [b"800kbps", b"0.8 Mbit/s", b"200MB", b"2.5s", b"1280x720", b"81.25%", b"uav-*"],
-        share=50,
-        most_bytes=400,
-    ),
-    Target(
-        "edge-command-line",
-        _command_line(EdgeConfig, check_edge),
-        lambda: list(_EDGE_LINES),
-        share=10,
-        short=250,
-        most_bytes=600,
-    ),
-    Target(
-        "ground-command-line",
-        _command_line(GroundConfig, lambda _settings: None),
-        lambda: list(_GROUND_LINES),
-        share=10,
-        short=250,
-        most_bytes=600,
-    ),
-    Target(
-        "settings-file",
-        _toml,
-        lambda: [
-            b'budget = "800kbps"\nsize = "640x360"\nconnect = ["tcp/127.0.0.1:7447"]\n',
-            b"once = true\n",
-        ],
-        share=10,
-        short=200,
-        most_bytes=1000,
-    ),
-    Target("zenoh-file", _zenoh, lambda: list(_ZENOH), share=8, short=200, most_bytes=1000),
-    Target(
-        "endpoint",
-        _endpoint,
-        lambda: [b"tcp/127.0.0.1:7447", b"tls/[::1]:1?a=b#c=d"],
-        share=8,
-        short=800,
-        most_bytes=300,
-    ),
+    Target("units", _units, lambda: _UNITS, share=50, most_bytes=400),
+    Target("edge-command-line", _EDGE, lambda: _EDGE_LINES, share=10, short=250, most_bytes=600),
+    Target("ground-command-line", _GROUND, lambda: _GROUND_LINES, share=10, short=250, most_bytes=600),
+    Target("settings-file", _toml, lambda: _SETTINGS, share=10, short=200, most_bytes=1000),
+    Target("zenoh-file", _zenoh, lambda: _ZENOH, share=8, short=200, most_bytes=1000),
+    Target("endpoint", _endpoint, lambda: _ENDPOINTS, share=8, short=800, most_bytes=300),
     Target("roster", _roster, lambda: [_roster_seed()], share=30, short=800, most_bytes=1000),
     Target("manifest", _manifest, lambda: [_MANIFEST], share=30, most_bytes=1000),
-    Target(
-        "labels",
-        _labels,
-        lambda: [b"{0: 'car', 1: 'bus'}", b'["car", "bus"]', b"car\nbus\n", b"((1, 2), {3: -4})"],
-        share=30,
-        short=800,
-        most_bytes=20_000,
-    ),
+    Target("labels", _labels, lambda: _NAMES, share=30, short=800, most_bytes=20_000),
 )

@@ -16,6 +16,7 @@ from hvt_study.datasets.class_map import joint_classes, map_classes
 from hvt_study.datasets.labels import covered_share
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.reference import reference_labels, with_labels
+from hvt_study.datasets.sequence import stage_clip
 from hvt_study.datasets.virtual_camera import VirtualCamera, read_annotations
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.judged import judged
@@ -101,6 +102,9 @@ def test_a_seed_is_a_way(root):
     sequence = pickle.loads(pickle.dumps(sequence))
     pairs = zip(islice(sequence.clip.images(), 3), again.images(), strict=False)
     assert all(np.array_equal(one, other) for one, other in pairs)
+    staged = stage_clip(sequence.limited(3).clip, root / "clip.bgr")  # as flights play it
+    assert all(map(np.array_equal, staged.images(), again.images()))
+    assert staged.pixels
     plain = VirtualCamera(root / "images" / "street.png")
     assert not np.array_equal(next(plain.images()), next(again.images()))
 

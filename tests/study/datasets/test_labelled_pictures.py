@@ -307,6 +307,8 @@ def another_image(number, name):
 
 UNKNOWN_PICTURE = "may be one of several pictures"
 UNREAD = "which are not read: export them as"
+OUTSIDE = r"a\.txt, line 1 has a box outside the picture"
+FROM_ONE = r"line 2 has class 2; there are 2, .* none is of class 0: count classes"
 REFUSED = [
     ({"labels/c.txt": ROW}, r"has no label of any of its 2 pictures, such as a\.jpg: looked in labels/"),
     ({"labels/a.txt": ROW}, r"no classes\.txt, obj\.names or data\.yaml"),
@@ -330,11 +332,11 @@ REFUSED = [
     # Of labels in pixels nothing is right; of classes from 1, each would be the next one, and the last left out.
     (
         {"images/a.txt": "1 50 35 60 50\n", "classes.txt": CLASSES},
-        r"a\.txt, line 1 has a box outside the picture",
+        OUTSIDE,
     ),
     (
         {"images/a.txt": ROW + ROW.replace("1", "2", 1), "classes.txt": CLASSES},
-        r"line 2 has class 2; there are 2, .* none is of class 0: count classes",
+        FROM_ONE,
     ),
     (
         {
@@ -354,7 +356,13 @@ def test_labels_that_cannot_be_judged_by_are_refused(tmp_path, files, said):
     """The set was taken for pictures that nobody labelled, for boxes of no size, or each for the next class."""
     lay(tmp_path, "images/a.jpg", "images/b.jpg", **files)
     with pytest.raises(UserError, match=said):
-        doubts_of([one for one in find_pictures(tmp_path, classes=None) if one.read(SIZE) or True])
+        judged(tmp_path, late=said in (UNKNOWN_PICTURE, OUTSIDE, FROM_ONE))
+
+
+def judged(root, *, late):
+    found = find_pictures(root, classes=None)
+    assert late, "it is told when a detector has looked at all pictures"
+    doubts_of([one for one in found if one.read(SIZE) or True])
 
 
 def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
