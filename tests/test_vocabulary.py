@@ -30,7 +30,7 @@ _NO_CLASS = frozenset({"Early", "Row", "Seen"})
 _OF_LIBRARIES = """
 on_tick
 ask haveImageWriter in_waiting keep_blank_values keep_trailing_newline
-set_log_tick_enabled set_xticks set_yticks tick_params timeout_keep_alive xticks yticks
+set_log_tick_enabled set_xticks set_yticks tick_params tick_values timeout_keep_alive xticks yticks
 """
 _LIBRARIES_SAY = frozenset(_OF_LIBRARIES.split())
 _OPTIONS = frozenset({"follow", "keep", "keep_video"})

@@ -111,7 +111,7 @@ class _Processes(ThreadPoolExecutor):
             process.join()
 
     def _start(self) -> None:
-        ensure_running()  # which unblocks what follows
+        ensure_running()  # it unblocks Ctrl-C
         # Blocked signals are inherited: one that is still being imported would answer Ctrl-C with a traceback.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         self._here.pipe, there = self._context.Pipe()
