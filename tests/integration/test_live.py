@@ -99,7 +99,6 @@ def keyframes(tap: Tap, *, after: int) -> list[BaseHeader]:
 
 
 def shown(timing: Path) -> int:
-    """How many frames a ground has decoded so far."""
     return sum(one.kind == "base" and bool(one.shown) for one in read_timing(timing))
 
 

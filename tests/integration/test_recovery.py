@@ -35,7 +35,6 @@ def pictures(long_scene: Path, tmp_path: Path) -> None:
 
 
 def shown(folder: Path, *, name: str = "timing.csv") -> list[Arrival]:
-    """The frames that a ground has decoded so far."""
     return [one for one in read_timing(folder / name) if one.kind == "base" and one.shown]
 
 

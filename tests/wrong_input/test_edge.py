@@ -50,23 +50,18 @@ def test_a_source_that_is_not_there(edge, here):
 @pytest.mark.parametrize(
     ("flag", "value", "accepted"),
     [
-        *(("size", value, "WIDTHxHEIGHT") for value in ("abc", "640", "-4x4", "640x360x3", "")),
-        *(
-            ("size", value, "between 64 and 8192")
-            for value in ("0x0", "641x360", "640x361", "100000x100", "32x32")
-        ),
-        *(("fps", value, "0.1 to 240") for value in ("0", "-1", "nan", "inf", "1e9", "many")),
-        *(
-            ("budget", value, "800kbps")
-            for value in ("0", "abc", "-5kbps", "nan", "1e12", "99999Mbps", "800 kB")
-        ),
-        *(("video-share", value, "0 to 1") for value in ("1.5", "-1", "most", "120%")),
-        *(("padding", value, "0 to 1") for value in ("9", "-0.1", "wide")),
+        # What is no quantity of its kind at all is told apart in tests/common/test_units.py.
+        ("size", "abc", "WIDTHxHEIGHT"),
+        *(("size", value, "between 64 and 8192") for value in ("641x360", "640x361", "100000x100", "32x32")),
+        *(("fps", value, "0.1 to 240") for value in ("0", "nan", "1e9")),
+        ("budget", "800 kB", "800kbps"),
+        ("video-share", "120%", "0 to 1"),
+        *(("padding", value, "0 to 1") for value in ("9", "-0.1")),
         *(("jpeg-quality", value, "5 to 95") for value in ("0", "400", "65.5")),
-        *(("detect-every", value, "1 to 1000") for value in ("0", "-5", "often")),
-        *(("max-frames", value, "from 1") for value in ("0", "-1")),
-        *(("cooldown", value, "2s") for value in ("-1s", "soon", "1e3")),
-        *(("wait", value, "2s") for value in ("-1", "99999999999s")),
+        *(("detect-every", value, "1 to 1000") for value in ("0", "often")),
+        ("max-frames", "0", "from 1"),
+        ("cooldown", "1e3", "2s"),
+        ("wait", "-1", "2s"),
         *(("source-fps", value, "0.1 to 1000") for value in ("0", "1e6")),
         *(("threads", value, "1 to 64") for value in ("0", "1000")),
         *(("confidence", value, "0.01 to 1") for value in ("0", "2")),

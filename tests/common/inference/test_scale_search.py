@@ -27,7 +27,6 @@ class Squares:
         self.runs = self.reduced = 0
 
     def detect(self, image):
-        """As wide as the picture is, enlarged or reduced."""
         if max(image.shape) <= 256:
             self.reduced += 1
         else:

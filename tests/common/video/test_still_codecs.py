@@ -27,7 +27,6 @@ def encoded(codec, crop, quality_pct):
 
 
 def decoded(codec, coded, crop, data=None):
-    """As the ground does, from other bytes if given."""
     return codec.decode(
         coded.data if data is None else data,
         size=(crop.shape[1], crop.shape[0]),

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from hvt_common.protocol.messages.bits import escaped, unescaped
-from hvt_common.video.hevc import nal_units
 from hvt_common.video.still_codecs import (
     BaseMissingError,
     StillError,
@@ -12,8 +10,6 @@ from hvt_common.video.still_codecs import (
     smallest_reaching,
     still_codec,
 )
-from hvt_common.video.still_codecs.h264_intra import decoded
-from hvt_common.video.still_codecs.h264_syntax import parameter_sets, verbatim_picture
 from hvt_common.video.still_codecs.residual import CHECKSUM
 from hvt_common.video.still_codecs.yuv420 import difference_bgr, filled_outside, to_bgr, to_planar
 from media.crops import textured, washed_out
@@ -24,7 +20,6 @@ SIZE = (117, 50)
 
 @pytest.fixture(scope="module")
 def pair():
-    """A crop and what the base shows of it."""
     crop = textured(*SIZE, seed=2)
     return crop, washed_out(crop)
 
@@ -84,15 +79,6 @@ def test_another_base_is_noticed(pair):
             CODEC.decode(data, size=SIZE, parameters=coded.parameters, base_bgr=base)
 
 
-@pytest.mark.parametrize("size", [(16, 16), (117, 50), (300, 40)])
-def test_the_reference_picture_is_verbatim(size):
-    """The difference would be added to another picture than it was taken from."""
-    picture = to_planar(np.random.default_rng(5).integers(0, 256, (size[1], size[0], 3), np.uint8))
-    whole = (picture.shape[1], picture.shape[0] * 2 // 3)
-    unit = parameter_sets(whole) + verbatim_picture(picture)
-    assert np.array_equal(decoded([unit], decoder="h264", size=whole), picture)
-
-
 def test_black_and_white_survive_the_planes():
     """A black or white base would be a level off everywhere, or break the reference picture's bytes."""
     for level in (0, 1, 128, 255):
@@ -112,15 +98,3 @@ def test_beyond_the_crop_the_source_is_the_base(pair):
     assert np.array_equal(filled[: SIZE[1], : SIZE[0]], source[: SIZE[1], : SIZE[0]])
     assert np.array_equal(filled[SIZE[1] : high], below[SIZE[1] : high])
     assert np.array_equal(filled[:high, SIZE[0] :], below[:high, SIZE[0] :])
-
-
-@pytest.mark.parametrize(
-    "body", [b"\x00\x00\x00\x00\x01", b"\x00\x00\x03\x00\x00\x02", b"ab\x00", b"\x00" * 9]
-)
-def test_escapes_are_undone(body):
-    """A run of zeros in a slice would end it early at the ground."""
-    guarded = escaped(body)
-    assert b"\x00\x00\x00" not in guarded
-    assert b"\x00\x00\x01" not in guarded
-    assert unescaped(guarded).startswith(body)
-    assert nal_units(b"\x00\x00\x01" + guarded) == [guarded]

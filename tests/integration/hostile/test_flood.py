@@ -107,7 +107,6 @@ class Flight:
         return is_shown
 
     def warned(self, running: Running) -> int:
-        """How often a process has spoken of a flood."""
         return len(re.findall(r"more than \d+ messages a second", running.said))
 
 

@@ -15,7 +15,6 @@ FLIGHT = "passthrough"
 
 
 def camera(clip: object) -> tuple[str, ...]:
-    """Settings of an edge that passes the clip through."""
     return ("--source", str(clip), "--encoder", "passthrough", "--detector", "motion", "--wait", "60s")
 
 

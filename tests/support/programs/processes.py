@@ -273,7 +273,6 @@ class Link:
         return self.start("hvt_edge.cli", [*where, *arguments], name=name)
 
     def start(self, module: str, arguments: list[str], *, name: str) -> Running:
-        """Start a program with these arguments and no others."""
         running = Running(module, arguments, folder=self.folder, name=name)
         self._started.append(running)
         return running

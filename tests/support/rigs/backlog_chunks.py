@@ -17,7 +17,6 @@ from rigs.flight import Flight
 
 
 def still_object(flight: Flight, index: int, sequence: int, **changes) -> bytes:
-    """A still of the red square in a frame."""
     changes = {"flags": int(Flags.STORED)} | changes
     item = flight.still(index, sequence, **changes)
     return pack_backlog_still(BacklogStill(item.attachment, item.encoding, item.payload))

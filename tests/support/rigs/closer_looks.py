@@ -115,7 +115,6 @@ class LookFlight(World):
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
-        """Decode the base stream, and keep what was requested."""
         del encoding
         if channel is Channel.BASE:
             header = BaseHeader.parse(attachment, payload)

@@ -146,7 +146,6 @@ def seen(
     class_name: str = "car",
     side_px: float = 20.0,
 ) -> StillSeen:
-    """A still of an edge track that was read."""
     event = refinement(
         frame_index=frame_index,
         capture_ns=frame_index * 66_666_667,

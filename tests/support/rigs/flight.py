@@ -158,7 +158,6 @@ def pipeline_of(
     search: ScaleSearch | None = None,
     detector_thread: DetectorThread | None = None,
 ) -> Pipeline:
-    """The perception pipeline of a session of this flight."""
     reader = reader or SameAnswer()
     names, places = unified_names(CLASSES, edge_classes)
     return Pipeline(
@@ -255,7 +254,6 @@ class Flight:
         return _received("base", unit.data, header.pack(unit.data), "video/h265")
 
     def still(self, index: int, sequence: int, *, data: bytes | None = None, **changes) -> Received:
-        """A still of the red square in a frame."""
         x1, y1, x2, y2 = square_box(index)
         crop = (int(x1), int(y1), int(x2), int(y2))
         if data is None:
@@ -355,7 +353,6 @@ class Port:
         self.keyframe_requests += 1
 
     def report(self, feedback: Feedback) -> None:
-        """Keeps it, as it would be on the wire."""
         self.reports.append(Feedback.parse(feedback.pack()))
 
     def request_info(self, session_id: int) -> None:

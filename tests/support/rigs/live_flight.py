@@ -294,7 +294,6 @@ class LiveFlight:
         heapq.heappush(self._events, (at_ns, next(self._count), call))
 
     def _pass(self, until_ns: int) -> None:
-        """Let time pass, and all happen that is due."""
         while self._events and self._events[0][0] <= until_ns:
             at_ns, _, call = heapq.heappop(self._events)
             self.now_ns = max(self.now_ns, at_ns)

@@ -93,7 +93,6 @@ def entries(cache: Path) -> Mapping[Path, tuple[int, bytes]]:
 
 
 def flights(cache: Path) -> list[Path]:
-    """Results of flights, and of weighings, that are remembered."""
     return sorted((cache / "flights").rglob("*.json"))
 
 
@@ -103,7 +102,6 @@ def said(folder: Path) -> str:
 
 
 def until(process: subprocess.Popen[str], true: Callable[[], object]) -> None:
-    """Wait for something that happens while the process runs."""
     eventually(lambda: true() or process.poll() is not None, what="a result is kept")
     assert process.poll() is None, "it ended before"
 
