@@ -1,10 +1,9 @@
-"""Detectors: heads, letterbox, suppression, names, and the real models."""
+"""Detectors: heads, letterbox, suppression, names."""
 
 import tracemalloc
 
 import cv2
 import numpy as np
-import onnxruntime as ort
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -456,65 +455,6 @@ def test_settings_out_of_range_are_refused(tmp_path, setting, metadata, words):
     path = colour_detector(tmp_path / "m.onnx", "yolox", metadata=metadata)
     with pytest.raises(UserError, match=words):
         open_detector(str(path), **setting)
-
-
-# --- real models ---------------------------------------------------------------------------------------------------
-
-
-def reference(path, image, *, confidence, size):
-    """A straightforward decode after the models' own documentation, one candidate after the other."""
-    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    yolox = "yolox" in path.name
-    height, width = image.shape[:2]
-    ratio = min(size[0] / width, size[1] / height)
-    new = (
-        (int(width * ratio), int(height * ratio)) if yolox else (round(width * ratio), round(height * ratio))
-    )
-    left, top = (0, 0) if yolox else ((size[0] - new[0]) // 2, (size[1] - new[1]) // 2)
-    canvas = np.full((size[1], size[0], 3), 114, np.float32)
-    canvas[top : top + new[1], left : left + new[0]] = cv2.resize(image, new)
-    tensor = canvas if yolox else canvas[..., ::-1] / np.float32(255)
-    output = session.run(None, {"images": np.ascontiguousarray(tensor.transpose(2, 0, 1)[None])})[0][0]
-    rows = []
-    for row, (x, y, stride) in zip(output if yolox else output.T, cells(size), strict=True):
-        scores = row[4] * row[5:] if yolox else row[4:]
-        if scores.max() >= confidence:
-            cx, cy, w, h = row[:4]
-            if yolox:
-                cx, cy, w, h = (cx + x) * stride, (cy + y) * stride, np.exp(w) * stride, np.exp(h) * stride
-            box = np.array([cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2]) - [left, top, left, top]
-            rows.append((np.clip(box / ratio, 0, [width, height] * 2), scores.max(), scores.argmax()))
-    boxes, scores, classes = (np.array(column) for column in zip(*rows, strict=True))
-    by_class = plain_suppression(boxes, scores, classes, 0.45)
-    kept = plain_suppression(boxes[by_class], scores[by_class], np.zeros(len(by_class), int), 0.8)
-    return [rows[by_class[i]] for i in kept]
-
-
-def street(data):
-    picture = data / "visdrone/0000001_02999_d_0000005.jpg"
-    return cv2.imread(str(picture)), picture.with_suffix(".txt")
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize(
-    ("name", "size"),
-    [
-        ("yolox_nano", (416, 416)),
-        ("yolox_nano", (640, 384)),
-        ("yolov5su_visdrone_640", (640, 640)),
-        ("yolov5su_visdrone_736x1280", (1280, 736)),
-    ],
-)
-def test_real_models_agree_with_a_plain_decode(data, name, size):
-    """A subtle mistake of scale, order or colour would cost accuracy that nobody can explain."""
-    path, (image, _) = data / f"models/{name}.onnx", street(data)
-    found = open_detector(str(path), confidence=0.3, size=size).detect(image)
-    expected = reference(path, image, confidence=0.3, size=size)
-    assert len(found) == len(expected) >= 4
-    np.testing.assert_allclose(found.confidences, [score for _, score, _ in expected], atol=2e-3)
-    for box, score, class_id in expected:
-        same = (np.abs(found.confidences - score) < 2e-3) & (found.class_ids == class_id)
-        assert np.abs(found.boxes_xyxy_px[same] - box).max(axis=1).min() < 1.0
 
 
 @pytest.mark.parametrize(("fps", "every"), [(0.5, 1), (2, 1), (5, 2), (10, 3), (15, 5), (60, 5)])

@@ -58,9 +58,13 @@ except FlightError:
 """
 
 
-@pytest.mark.parametrize("one", STOP_SIGNALS)
 @pytest.mark.parametrize(
-    ("within", "what", "code"), [("60", "again", -1), ("0.1", "hangs", 1), ("0.1", "slow", 0)]
+    ("one", "within", "what", "code"),
+    [
+        *((one, "60", "again", -1) for one in STOP_SIGNALS),
+        (signal.SIGINT, "0.1", "hangs", 1),
+        (signal.SIGTERM, "0.1", "slow", 0),
+    ],
 )
 def test_a_program_that_hangs_needs_no_kill(one, within, what, code):
     """An encoder, a driver or an extra that did not answer: two Ctrl-C were not heard, nor what systemd sends.

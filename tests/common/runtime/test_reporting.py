@@ -128,8 +128,7 @@ def test_a_disk_without_room_leaves_no_half_of_a_summary(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("reader", ["true", "head -1"])
+@pytest.mark.parametrize(("reader", "unbuffered"), [("true", ""), ("head -1", "1")])
 def test_a_reader_that_leaves_ends_the_program_without_a_word(reader, unbuffered):
     """``hvt-models list | head`` would end in a traceback."""
     program = (

@@ -18,8 +18,8 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.flow import box_flow
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, iou
+from hvt_study.metrics.tracking import compare_tracks
 from rigs.examples import detections
-from studies.clear_mot import Frames, score
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -93,9 +93,11 @@ def test_reproduces_the_authors_program_box_by_box(data):
 def test_every_fifth_frame_still_follows_the_scene(data):
     """Detection every fifth frame (the default) would lose or mix up objects between the detections."""
     detections, reference = palace(data)
-    truth: Frames = {k: (rows[:, 1].astype(int), rows[:, 2:6]) for k, rows in reference.items()}
-    ours = run(ByteTracker(fps=30), detections, every=5)
-    result = score(truth, {t.frame_index: (t.ids, t.boxes_xyxy_px.astype(float)) for t in ours})
+    truth = [(rows[:, 1].astype(int), rows[:, 2:6]) for rows in reference.values()]
+    ours = [
+        (one.ids, one.boxes_xyxy_px.astype(float)) for one in run(ByteTracker(fps=30), detections, every=5)
+    ]
+    result = compare_tracks(list(zip(truth, ours, strict=True)), least_iou=0.5)
     assert result.idf1 > 0.78
     assert result.mota > 0.84
 
