@@ -28,14 +28,6 @@ def offered(pipe: Pipe, *, every_s: float, lasts_s: float) -> list[tuple[float, 
     return [(i * every_s, pipe.datagram(PACKET, i * every_s)) for i in range(int(lasts_s / every_s))]
 
 
-@pytest.mark.parametrize("rate_bps", [200_000, 1_000_000])
-def test_the_rate_is_the_scripts(rate_bps):
-    """A link that carries a tenth more than said would hold bars that the radio does not."""
-    pipe = Pipe(script((0, LinkState(rate_bps))), seed=1)
-    got = [at for _, at in offered(pipe, every_s=0.004, lasts_s=20) if at is not None]
-    assert 8 * PACKET * (len(got) - 1) / (got[-1] - got[0]) == pytest.approx(rate_bps, rel=0.03)
-
-
 def test_the_rate_follows_a_step():
     """The step down would come late or half, and the adaptation look better than it is."""
     pipe = Pipe(script((0, LinkState(1_000_000)), (10, LinkState(200_000)), lasts_s=20), seed=1)

@@ -1,9 +1,7 @@
 """What gives way when far more comes than can be looked at, and that it is told of once."""
 
-import pickle
 from dataclasses import replace
 
-from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.transport.inbox import FloodWatch, Inbox, Received, TokenBucket
 
 SECOND_NS = 1_000_000_000
@@ -50,16 +48,3 @@ def test_one_row_does_not_keep_the_others_out_of_the_inbox():
     inbox = Inbox(capacity=100, capacity_bytes=1000, share=0.5)
     put(9)
     assert put(1, key="hvt/uav-1/roi") == (6, 4)
-
-
-def test_the_account_of_a_flood_stays_small():
-    """A sender whose clock stands still, or who invents reasons, would fill the memory of the ground."""
-    ledger = Ledger()
-    for number in range(80_000):
-        ledger.count(Account.ROI, payload_bytes=10, attachment_bytes=5, overhead_bytes=5, at_ns=SECOND_NS)
-        ledger.record_outcome("received", f"reason {number}")
-    assert len(pickle.dumps(ledger)) < 3_000_000, "two queues of 65 536 messages; all of them would be more"
-    assert ledger.line_bytes == 80_000 * 20
-    reasons = ledger.outcomes("received")
-    assert len(reasons) == 24
-    assert reasons["other"] == 80_000 - 23
