@@ -91,7 +91,6 @@ class LookFlight(World):
         return PassedOn(inner, before=self.before)
 
     def open_link(self, stack: Any, config: EdgeConfig) -> Any:
-        del stack, config
         return self
 
     # The link
@@ -102,7 +101,6 @@ class LookFlight(World):
         return False
 
     def has_subscriber(self, channel: Channel) -> bool:
-        del channel
         return True
 
     def mend(self) -> None:
@@ -115,7 +113,6 @@ class LookFlight(World):
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
-        del encoding
         if channel is Channel.BASE:
             header = BaseHeader.parse(attachment, payload)
             self.base_times_ns.append(header.capture_ns + header.send_delay_ns)

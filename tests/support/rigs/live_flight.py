@@ -88,7 +88,6 @@ class _Encoder:
     mean_qp: float = 35.0
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Any] = ()) -> AccessUnit:
-        del regions
         mean = self.bitrate_bps / 8 / self.fps
         if keyframe:
             least = self.texture * keyframe_floor_bytes(self.size)
@@ -268,7 +267,6 @@ class LiveFlight:
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
-        del encoding
         if self.second < self.joins_s:
             return
         size_bytes = len(payload) + len(attachment or b"") + 60
