@@ -145,7 +145,7 @@ class Edge:
                     note=line.note,
                     turn=lambda: stages.heartbeat.turn("waiting"),
                 )
-            stages.link.operating.start(world.clock())
+            stages.link.operating.set(started_ns=world.clock())
             broken: Exception | None = None
             try:
                 self._play(source, stages, link, line)

@@ -188,7 +188,7 @@ class Commands:
                 raise RefusedError("the rates were changed a moment ago: wait two seconds")
             self._check_base(budget_bps, video_share)
             self._changed_ns = now_ns
-        self.operating.command(budget_bps=budget_bps, video_share=video_share, method=method_name)
+        self.operating.set(budget_bps=budget_bps, video_share=video_share, method=method_name)
         if rates_change:
             self.keyframes.require(self.loop_clock())
 

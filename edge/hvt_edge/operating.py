@@ -96,35 +96,11 @@ class Operating:
     def now(self) -> OperatingPoint:
         return self._point
 
-    def start(self, now_ns: int) -> None:
-        """Note that the first frame is about to be taken."""
-        self._set(started_ns=now_ns)
-
-    def command(self, *, budget_bps: int, video_share: float | None, method: str) -> None:
-        """Note a ground's command; the rates take effect with the next keyframe."""
-        highest_bps = max(self._point.highest_budget_bps, budget_bps)
-        self._set(
-            budget_bps=budget_bps, video_share=video_share, method=method, highest_budget_bps=highest_bps
-        )
-
-    def allow(self, total_bps: int) -> None:
-        self._set(total_bps=total_bps)
-
-    def open(self, rates: Rates, *, total_bps: int) -> None:
-        """Note the rates for which x265 is opened, and the total that may be sent now."""
-        self._set(total_bps=total_bps, base_bps=rates.base_bps, decimation=rates.decimation)
-
-    def encode_with(self, preset: str, says: str) -> None:
-        """Use this preset from the next keyframe on; ``says`` is the sentence about it."""
-        self._set(preset=preset, preset_says=says)
-
-    def decide(self, decisions: AutoDecisions) -> None:
-        """Set which parts are sent beside the video, as decided by the measurements."""
-        self._set(decisions=decisions)
-
-    def _set(self, **changes: object) -> None:
+    def set(self, **changes: Any) -> None:
+        """Set these fields of `OperatingPoint`; a budget, a share or a preset takes effect with the next keyframe."""
         with self._lock:
-            self._point = replace(self._point, **changes)  # type: ignore[arg-type]
+            now = replace(self._point, **changes)
+            self._point = replace(now, highest_budget_bps=max(now.highest_budget_bps, now.budget_bps))
 
 
 @dataclass(eq=False)

@@ -101,7 +101,7 @@ class AutoControl:
         self._paused_until_ns: int | None = None
         self._pauses = 1
         self._too_slow = False
-        operating.decide(AutoDecisions(tracks=False))
+        operating.set(decisions=AutoDecisions(tracks=False))
 
     def take_answer(self, *, changed: bool) -> None:
         """A ground has inspected a still; ``changed``: only by that still it names another object than the edge."""
@@ -138,7 +138,7 @@ class AutoControl:
             stills = wanted and not self._too_slow
             decisions = AutoDecisions(tracks, stills, self._says(tracks=tracks, stills=stills))
             if decisions != before:
-                self._operating.decide(decisions)
+                self._operating.set(decisions=decisions)
             return decisions
 
     @property

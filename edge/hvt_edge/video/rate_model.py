@@ -305,7 +305,7 @@ class PresetControl:
         )
         if now.preset in (faster.preset, choice.preset, slower.preset):
             return False
-        self._operating.encode_with(choice.preset, choice.says)
+        self._operating.set(preset=choice.preset, preset_says=choice.says)
         _log.info("%s", choice.says or f"preset {choice.preset}: there is time for it again")
         return True
 

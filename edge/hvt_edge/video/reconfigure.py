@@ -185,13 +185,13 @@ class EncoderReconfiguration:
     def _open(self, rates: Rates, *, total_bps: int, now_ns: int) -> Encoder:
         self.count += 1
         self._opened = rates
-        self.operating.open(rates, total_bps=total_bps)
+        self.operating.set(total_bps=total_bps, base_bps=rates.base_bps, decimation=rates.decimation)
         self._set_budget(now_ns)
         return self.open_again()
 
     def _allow(self, total_bps: int, now_ns: int) -> None:
         if total_bps != self.operating.now.total_bps:
-            self.operating.allow(total_bps)
+            self.operating.set(total_bps=total_bps)
             self._set_budget(now_ns)
 
     def _set_budget(self, now_ns: int) -> None:

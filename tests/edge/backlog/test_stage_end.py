@@ -61,28 +61,18 @@ def test_frames_and_stills_lost_at_the_end_of_a_clip_come_as_what_was_kept(tmp_p
     assert "stored" not in rig.ledger.outcomes("sent"), "it counted when it was sent"
 
 
-def test_a_still_that_is_pending_at_the_end_does_not_hold_up_what_was_stored(tmp_path):
-    """It will not be sent any more, and the store would only trickle until the run gives up."""
-    rig = Rig(tmp_path / "store")
-    rig.play(0, 21, reports=True)
-    rig.play(21, 45, linked=False)
-    rig.linked = True
-    rig.outbox.offer(OutboxStill(PENDING, None, 1.0, rig.now_ns))
-    rig.finish()
-    assert rig.backlog.worker.numbers.empty
-    sizes = [len(data) for _, data in rig.out.backlog]
-    assert max(sizes) > 1400, "no trickle"
-    rig.close()
-
-
-def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
-    """What was kept last would stay on the drone until its next start."""
+@pytest.mark.parametrize("pending", [False, True])
+def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path, pending):
+    """What was kept last would stay on the drone until its next start, or trickle for a still that never goes."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
     rig.play(21, 110, linked=False)
     rig.store()
     rig.linked = True
+    if pending:
+        rig.outbox.offer(OutboxStill(PENDING, None, 1.0, rig.now_ns))
     rig.finish()
+    assert max(len(data) for _, data in rig.out.backlog) > 1400, "no trickle"
     ground = rig.out.ground
     assert ground.frames | set(ground.backlog_frames) == set(range(110))
     assert {number: ground.backlog_frames[number] for number in range(21, 110)}.items() <= rig.coded.items()

@@ -183,7 +183,7 @@ def test_a_budget_that_was_lowered_too_far_can_be_raised_again(adapt):
     def command(second: float) -> None:
         bps = {5.0: 60_000, 15.0: BUDGET_BPS}.get(second)
         if bps is not None:
-            flight.operating.command(budget_bps=bps, video_share=1.0, method="M0")
+            flight.operating.set(budget_bps=bps)
 
     got = flight.fly(camera(30, key_bytes=15_000), before=command)
     assert got[8:15] == [0] * 7, "no window of 60 kbps holds its keyframes"

@@ -183,7 +183,7 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
     operating = Operating(budget_bps=300_000, video_share=None, base_bps=300_000, method="M6", decimation=1)
     opened = []
     reconfiguration = reconfiguration_of(operating, split(300_000, most_sparse_share=0.9), opened.append)
-    operating.decide(AutoDecisions(stills=False))
+    operating.set(decisions=AutoDecisions(stills=False))
     reconfiguration.split.observe([], moment(0))
     for decimation, share in ((2, 0.9), (1, 1.0)):
         reconfiguration(decimation, SECOND)
@@ -201,5 +201,5 @@ def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     for number in range(60):
         reconfiguration.split.observe(crowd(8), moment(number / 3, from_source=True))
     assert not reconfiguration.wants_keyframe(30 * SECOND)
-    operating.decide(AutoDecisions(stills=False))
+    operating.set(decisions=AutoDecisions(stills=False))
     assert reconfiguration.wants_keyframe(30 * SECOND)

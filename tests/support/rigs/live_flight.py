@@ -357,8 +357,7 @@ class LiveFlight:
         self.transmitter.metadata(Channel.STATUS, lambda _: bytes(330), now_ns=self.now_ns)
 
     def _command(self, budget_bps: int) -> None:
-        now = self.operating.now
-        self.operating.command(budget_bps=budget_bps, video_share=now.video_share, method=now.method)
+        self.operating.set(budget_bps=budget_bps)
         self.keyframes.require(self.now_ns)
 
     # What comes back
