@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_edge.operating import Keyframes, KeyframeSettings, LoopClock, Operating, Rates, base_rate_bps
+from hvt_edge.operating import Keyframes, KeyframeSettings, LoopClock, Operating, base_rate_bps
 
 MS = 1_000_000
 STEP_NS = 66_666_667
@@ -221,8 +221,8 @@ def test_a_reader_has_one_moment():
     """Status would tell the budget of now with the rate of before."""
     holder = Operating(budget_bps=400_000, video_share=0.75, base_bps=300_000, method="M5", decimation=1)
     before = holder.now
-    holder.command(budget_bps=200_000, video_share=None, method="M6")
-    holder.open(Rates(total_bps=150_000, base_bps=100_000, decimation=3), total_bps=150_000)
+    holder.set(budget_bps=200_000, video_share=None, method="M6")
+    holder.set(total_bps=150_000, base_bps=100_000, decimation=3)
     assert (before.budget_bps, before.method, before.decimation) == (400_000, "M5", 1)
     now = holder.now
     assert (now.budget_bps, now.video_share, now.method) == (200_000, None, "M6")
