@@ -296,6 +296,7 @@ class Hub:
         for edge in absent & self._absent:
             del self.edges[edge]
             self._loads.pop(edge, None)
+            self._to_all(text("gone", edge=edge))
         self._absent = absent & self.edges.keys()
         for edge, load in loads.items():
             self._loads.setdefault(edge, deque(maxlen=_MOST_LOADS)).append(load)

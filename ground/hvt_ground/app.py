@@ -15,7 +15,7 @@ from typing import Any
 
 import zenoh
 
-from hvt_common.errors import FlightError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, Turns, reason_of
 from hvt_common.runtime.plug_ins import health_server
@@ -202,8 +202,10 @@ class Ground:
             try:
                 while self._serve_link(session, parts):
                     links.close()
-                    self._anew, self._began_s = True, time.monotonic()
-                    session = links.enter_context(self._open_link(models))
+                    anew = self._link_anew(links, parts)
+                    if anew is None:
+                        break
+                    session = anew
                     client.go_on(session)
             except Exception as error:
                 if models.error is not None:
@@ -215,6 +217,23 @@ class Ground:
     def _open_link(self, models: Models) -> AbstractContextManager[zenoh.Session]:
         self._deaf.clear()
         return open_session(self._config.link, failures=models.failures, on_deaf=self._deaf.set)
+
+    def _link_anew(self, links: ExitStack, parts: _Parts) -> zenoh.Session | None:
+        # None where the run ends meanwhile: a file of the link's may be gone for a while, or its port taken.
+        self._anew, maker = True, self._state_maker(parts, None)
+        while not self._stop.is_set():
+            try:
+                session = links.enter_context(self._open_link(parts.models))
+            except (UserError, zenoh.ZError) as error:
+                parts.models.failures.failed("link", reason_of(error))
+                notify_systemd("WATCHDOG=1")
+                self._tell(maker, parts, "no link")
+                self._stop.wait(_POLL_S * _STATUS_EVERY_POLLS)
+            else:
+                parts.models.failures.works("link")
+                self._began_s = time.monotonic()
+                return session
+        return None
 
     def _serve_link(self, session: zenoh.Session, parts: _Parts) -> bool:
         # Serve its edges; returns whether to go on with another session.
@@ -273,17 +292,8 @@ class Ground:
             note(f"hvt-ground: {yet}watch at {page}")
 
     def _serve(self, link: GroundLink, parts: _Parts, watch: LinkWatch, group: Group | None) -> None:
-        config, models, line, polls = self._config, parts.models, parts.line, 0
-        maker = StateMaker(
-            self._clock,
-            detector=Path(config.detector).name,
-            classifier=Path(config.classifier or "none").name,
-            calibrated=models.facts.stills_calibrated,
-            failures=models.failures,
-            loading=lambda: models.loading,
-            recorded=parts.factory.records,
-            group=group,
-        )
+        config, models, polls = self._config, parts.models, 0
+        maker = self._state_maker(parts, group)
         while not self._stop.wait(_POLL_S):
             if polls % _STATUS_EVERY_POLLS == 0:
                 notify_systemd("WATCHDOG=1")
@@ -292,7 +302,7 @@ class Ground:
             for port in ports:
                 if port.edge not in self._edges:
                     self._edges[port.edge] = self._serve_edge(port, parts.factory)
-                    self._say_rights(port, line, watch)
+                    self._say_rights(port, parts.line, watch)
             if models.error is not None:
                 raise models.error
             self._raise_error()
@@ -302,12 +312,28 @@ class Ground:
                 failed = {one.part for one in models.failures.now}
                 if self._anew and "listener" in failed:
                     self._began_s = time.monotonic()  # nobody can come back yet
-                self._state = maker.make(sorted(self._edges.items()))
-                for one in parts.watchers:
-                    one.show(self._state)
-                line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
+                self._tell(maker, parts, "no link" if watch.trouble else "no edge yet")
             if self._deaf.is_set() or (config.once and self._all_ended(loading=models.loading)):
                 return
+
+    def _state_maker(self, parts: _Parts, group: Group | None) -> StateMaker:
+        config, models = self._config, parts.models
+        return StateMaker(
+            self._clock,
+            detector=Path(config.detector).name,
+            classifier=Path(config.classifier or "none").name,
+            calibrated=models.facts.stills_calibrated,
+            failures=models.failures,
+            loading=lambda: models.loading,
+            recorded=parts.factory.records,
+            group=group,
+        )
+
+    def _tell(self, maker: StateMaker, parts: _Parts, nobody: str) -> None:
+        self._state = maker.make(sorted(self._edges.items()))
+        for one in parts.watchers:
+            one.show(self._state)
+        parts.line.show(status_text(self._state) or nobody)
 
     def _serve_edge(self, port: EdgePort, factory: SessionFactory) -> EdgeSessions:
         return EdgeSessions(

@@ -15,8 +15,9 @@ from typing import Any
 
 import pytest
 
-from hvt_common.errors import FlightError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import GroupKeys
+from hvt_common.transport.session import open_session
 from hvt_ground import app
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
@@ -103,20 +104,30 @@ def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path, cl
     run.wait()
 
 
+def refused(*_: Any, **__: Any) -> Any:
+    """A file of the link's is gone for a while."""
+    raise UserError("cannot read ca.pem")
+
+
 def test_a_listener_that_hears_nothing_any_more_is_made_anew(
     free_port: int, tmp_path: Path, monkeypatch, caplog, clock
 ) -> None:
     """No picture would come back once the ground's radio was plugged in anew, or the ground stood still.
 
-    With ``--once`` it would end before an edge can have come back, or never if none does.
+    It ended, too, where a file of the link's was gone or its port taken just then. With ``--once`` it
+    would end before an edge can have come back, or never if none does.
     """
     there, anew = socket.if_nameindex(), "since its interface was removed: the link is made anew"
     monkeypatch.setattr(socket, "if_nameindex", lambda: there if anew in caplog.text else [])
+    opens = iter((open_session, refused, refused, open_session))
+    monkeypatch.setattr(app, "open_session", lambda *args, **more: next(opens)(*args, **more))
     listen = (f"tcp/127.0.0.1:{free_port}#iface=lo",)
     run = Run(replace(config(free_port, tmp_path, once=True, wait=20.0), listen=listen))
     try:
-        eventually(lambda: "listener: works again" in caplog.text)
+        eventually(lambda: "link: works again" in caplog.text)
         assert f"hears nothing any more, {anew}" in caplog.text
+        said = "link: cannot read ca.pem; all else goes on, and it is tried again"
+        assert caplog.messages.count(said) == caplog.messages.count("link: works again") == 1
         clock.now_s = 30.0
         time.sleep(0.5)  # it looks several times
         with joined(f"tcp/127.0.0.1:{free_port}") as outsider, outsider.liveliness().declare_token(ALIVE):

@@ -93,6 +93,9 @@ function onMessage(message, payload) {
       if (mine) describe();
       else if (!chosen) chooseFirst();
       break;
+    case "gone":
+      leave(message.edge);
+      break;
     case "state":
       onGroundState(message);
       break;
@@ -136,6 +139,17 @@ function onMessage(message, payload) {
 }
 
 // Which edge
+
+/** @param {string} edge that the ground has forgotten */
+function leave(edge) {
+  for (const known of [sessions, states, asked, plot.rows]) known.delete(edge);
+  wall.leave(edge);
+  if (edge !== chosen) return;
+  chosen = "";
+  by("main").hidden = true;
+  wall.mark("");
+  chooseFirst(); // it, where it comes again
+}
 
 /** The one that the address names; where it names none, the first. */
 function chooseFirst() {

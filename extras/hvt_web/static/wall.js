@@ -107,15 +107,22 @@ export class Wall {
     }
   }
 
+  /** @param {string} edge */
+  leave(edge) {
+    const card = this.cards.get(edge);
+    if (!card) return;
+    URL.revokeObjectURL(card.picture.src);
+    card.button.remove();
+    this.cards.delete(edge);
+    this.nobody.hidden = this.root.children.length > 1;
+  }
+
   /**
    * Edges that other grounds of the group serve, each a way to their page.
    * @param {Record<string, {member: string, page: string}>} edges
    */
   elsewhere(edges) {
-    for (const edge of Object.keys(edges)) {
-      this.cards.get(edge)?.button.remove(); // it was here before
-      this.cards.delete(edge);
-    }
+    for (const edge of Object.keys(edges)) this.leave(edge); // it was here before
     const now = JSON.stringify(edges);
     if (now === this.others) return;
     this.others = now;
@@ -126,7 +133,7 @@ export class Wall {
       make("b", "", tile).textContent = edge;
       make("span", "", tile).textContent = words.elsewhereWords(member);
     }
-    if (this.root.children.length > 1) this.nobody.hidden = true;
+    this.nobody.hidden = this.root.children.length > 1;
   }
 
   /** @param {string} chosen empty for none */

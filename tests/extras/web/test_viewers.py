@@ -235,11 +235,14 @@ def test_stills_of_the_flight_before_stay_where_an_edge_starts_again(hub):
 
 def test_edges_that_the_ground_has_left_are_forgotten(hub):
     """Who invents names would fill its memory, and every wall; a newcomer is there before the state knows it."""
+    viewer = Viewer()
+    hub.join(viewer)
     for name in ("gone", "here"):
         hub.begin(EdgePage(name), {"edge": name})
-    hub.state("{}", {"gone": (0, 1.0, 1.0, 1.0)}, known=frozenset({"gone", "here"}))
-    hub.state("{}", {}, known=frozenset({"here"}))
+    hub.state('{"type": "state"}', {"gone": (0, 1.0, 1.0, 1.0)}, known=frozenset({"gone", "here"}))
+    hub.state('{"type": "state"}', {}, known=frozenset({"here"}))
     hub.begin(EdgePage("new"), {"edge": "new"})
     assert hub.edges.keys() == {"gone", "here", "new"}
-    hub.state("{}", {}, known=frozenset({"here"}))
+    hub.state('{"type": "state"}', {}, known=frozenset({"here"}))
     assert hub.edges.keys() == {"here", "new"}
+    assert kinds(viewer)[-2:] == ["gone", "state"], "an open page had it for as long as it stayed open"

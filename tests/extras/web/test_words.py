@@ -184,7 +184,7 @@ def test_no_text_of_the_page_is_written_elsewhere():
 
 ELEMENTS = """
   const element = () => ({ dataset: {}, classList: { toggle() {} }, children: [], append() {}, insertBefore() {},
-    setAttribute() {}, addEventListener() {}, querySelector: () => null });
+    remove() {}, setAttribute() {}, addEventListener() {}, querySelector: () => null });
   globalThis.document = { createElement: element };
 """
 
@@ -207,7 +207,8 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
       wall.state("uav-1", {{ ...state("up"), total: 2e5, budget: 5e5 }}, 112000);
       wall.refresh(112000, new Set(["uav-2"])); // a ground that was restarted tells of that one alone
       const {{ light, bar }} = wall.card("uav-1");
-      console.log(JSON.stringify([...seen, [light.dataset.state, bar.ariaValueText]]));
+      wall.leave("uav-1");
+      console.log(JSON.stringify([...seen, [light.dataset.state, bar.ariaValueText], [wall.cards.size, wall.nobody.hidden]]));
     """)
     silent = ["silent", "no picture 12 s"]
     assert found == [
@@ -216,6 +217,7 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
         silent,
         ["lost", "lost 12 s"],
         ["unknown", "200 kbps of 500 kbps"],
+        [0, False],
     ]
 
 
