@@ -35,7 +35,7 @@ class World:
 
     def open_detector(self, config: EdgeConfig) -> Detector:
         """Open the detector. Raises `UserError` where there is none of that name."""
-        return make_detector(config)
+        return make_detector(config, None if config.pace == "lockstep" else self.failures)
 
     def warm_up(self, config: EdgeConfig, detector: Detector, source: Source) -> None:
         """Prepare the detector before the first frame: a runtime may compile for the size of the pictures."""

@@ -104,11 +104,6 @@ def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path, cl
     run.wait()
 
 
-def refused(*_: Any, **__: Any) -> Any:
-    """A file of the link's is gone for a while."""
-    raise UserError("cannot read ca.pem")
-
-
 def test_a_listener_that_hears_nothing_any_more_is_made_anew(
     free_port: int, tmp_path: Path, monkeypatch, caplog, clock
 ) -> None:
@@ -119,8 +114,14 @@ def test_a_listener_that_hears_nothing_any_more_is_made_anew(
     """
     there, anew = socket.if_nameindex(), "since its interface was removed: the link is made anew"
     monkeypatch.setattr(socket, "if_nameindex", lambda: there if anew in caplog.text else [])
-    opens = iter((open_session, refused, refused, open_session))
-    monkeypatch.setattr(app, "open_session", lambda *args, **more: next(opens)(*args, **more))
+    opened = iter((True, False, False, True))
+
+    def opens(*given: Any, **more: Any) -> Any:
+        if next(opened):
+            return open_session(*given, **more)
+        raise UserError("cannot read ca.pem")
+
+    monkeypatch.setattr(app, "open_session", opens)
     listen = (f"tcp/127.0.0.1:{free_port}#iface=lo",)
     run = Run(replace(config(free_port, tmp_path, once=True, wait=20.0), listen=listen))
     try:

@@ -27,6 +27,7 @@ from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model, own_steps
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import Detections, Image
 
 _log = logging.getLogger(__name__)
@@ -90,6 +91,7 @@ def open_detector(
     head: str | None = None,
     threads: int = 1,
     provider: str = "cpu",
+    failures: Failures | None = None,
 ) -> Detector:
     """Open a detector: ``motion``, the name of a model (see `resolve_model`), a file, a plug-in's name, or ``A+B``.
 
@@ -99,7 +101,8 @@ def open_detector(
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
     hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). ``confidence`` of a plug-in is applied to
     its answer, that of ``A+B`` (`hvt_models.detectors`) is on the scale of A. For these and for `MOTION` ``labels``,
-    ``head`` and ``size`` are refused.
+    ``head`` and ``size`` are refused. With ``failures`` a part of ``A+B`` that raises is opened again alone; the
+    others go on.
     Raises `UserError` where there is no such model, it is no detector, its labels do not fit, or a setting is out of
     its range.
     """
@@ -115,7 +118,7 @@ def open_detector(
                 raise UserError(f"{word} {given} has no effect: {spec!r} is no network of one file")
     if parts[1:]:
         settings = {"nms_iou": nms_iou, "threads": threads, "provider": provider}
-        return _open_ensemble(parts, confidence=confidence, settings=settings)
+        return _open_ensemble(parts, confidence=confidence, settings=settings, failures=failures)
     if spec == MOTION:
         motion: Detector = needed_part(MOTION, f"detector {MOTION}")(confidence=confidence)
         return motion
@@ -126,7 +129,9 @@ def open_detector(
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size, head=head)
 
 
-def _open_ensemble(parts: tuple[str, ...], *, confidence: float, settings: Mapping[str, Any]) -> Detector:
+def _open_ensemble(
+    parts: tuple[str, ...], *, confidence: float, settings: Mapping[str, Any], failures: Failures | None
+) -> Detector:
     name = "+".join(parts)
     if MOTION in parts:
         raise UserError(
@@ -136,6 +141,7 @@ def _open_ensemble(parts: tuple[str, ...], *, confidence: float, settings: Mappi
         lambda part, confidence: open_detector(part, confidence=confidence, **settings),
         {part: default_confidence(part) for part in parts},
         confidence=confidence,
+        failures=failures,
     )
     return ensemble
 

@@ -28,6 +28,7 @@ from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
 from hvt_common.inference.tiles import parse_tiles, searches_scale, tiled
 from hvt_common.inference.view_trust import ViewTrust
+from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View
@@ -53,7 +54,7 @@ _DETAIL_WEIGHT = 5.0
 """If the base has none of the source's pixels, details count for more than a class (docs/legibility.md)."""
 
 
-def make_detector(config: EdgeConfig) -> Detector:
+def make_detector(config: EdgeConfig, failures: Failures | None = None) -> Detector:
     """Open the detector, with weak detections included: they may carry a track on, though not start one."""
     detector = open_detector(
         config.detector,
@@ -64,6 +65,7 @@ def make_detector(config: EdgeConfig) -> Detector:
         threads=config.threads,
         # By speed auto may choose one provider this time and another the next, and their answers differ a little.
         provider="cpu" if config.pace == "lockstep" and config.provider == "auto" else config.provider,
+        failures=failures,
     )
     return tiled(detector, config.tiles) if config.candidates == "source" else detector
 

@@ -9,13 +9,16 @@ those here know different views, and the surest of a cluster counts (docs/embedd
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.class_names import group_of, kind_of
-from hvt_common.inference.detect import Detector
+from hvt_common.inference.detect import Detector, FailingDetector
 from hvt_common.inference.nms import MAX_DETECTIONS
+from hvt_common.inference.retried import RetriedDetector
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import Detections, Image
 
 _SAME_IOU = 0.55
@@ -37,14 +40,24 @@ def on_scale_of(confidences: npt.NDArray[np.float32], own: float, wanted: float)
 
 
 def open_ensemble(
-    opened: Callable[[str, float], Detector], owns: Mapping[str, float], *, confidence: float
+    opened: Callable[[str, float], Detector],
+    owns: Mapping[str, float],
+    *,
+    confidence: float,
+    failures: Failures | None = None,
 ) -> EnsembleDetector:
     """The ensemble of the parts that ``owns`` names, with their confidences of use.
 
-    ``opened`` opens one, with the least confidence of a detection on the part's own scale.
+    ``opened`` opens one, with the least confidence of a detection on the part's own scale. With ``failures`` one that
+    raises is opened again, and the others go on.
     """
     first, least = next(iter(owns.values())), np.array([confidence], np.float32)
-    parts = [opened(part, float(on_scale_of(least, first, own)[0])) for part, own in owns.items()]
+    parts: list[FailingDetector] = []
+    for part, own in owns.items():
+        open_one = partial(opened, part, float(on_scale_of(least, first, own)[0]))
+        parts.append(
+            open_one() if failures is None else RetriedDetector(open_one, f"detector {part}", failures)
+        )
     return EnsembleDetector(parts, list(owns.values()), confidence=confidence)
 
 
@@ -55,7 +68,7 @@ class EnsembleDetector:
     least of a detection.
     """
 
-    def __init__(self, parts: Sequence[Detector], owns: Sequence[float], *, confidence: float) -> None:
+    def __init__(self, parts: Sequence[FailingDetector], owns: Sequence[float], *, confidence: float) -> None:
         self._parts, self._owns, self._confidence = tuple(parts), tuple(owns), confidence
         names: list[str] = list(parts[0].class_names)
         kinds = [kind_of(name) for name in names]
@@ -71,13 +84,16 @@ class EnsembleDetector:
         self._groups = np.array([groups.index(group) for group in groups], np.int32)
         self._vague = np.array([kinds[i] == groups[i] for i in range(len(names))])
 
-    def detect(self, image_bgr: Image) -> Detections:
-        """Each part's detections on the confidence scale of the first, merged."""
-        found = []
+    def detect(self, image_bgr: Image) -> Detections | None:
+        """Each part's detections on the confidence scale of the first, merged; None while all parts fail."""
+        found: list[Detections] = []
         for part, own, ids in zip(self._parts, self._owns, self._ids, strict=True):
-            one = part.detect(image_bgr)
+            if (one := part.detect(image_bgr)) is None:
+                continue
             sure = on_scale_of(one.confidences, own, self._owns[0])
             found.append(Detections(one.boxes_xyxy_px, sure, ids[one.class_ids]))
+        if not found:
+            return None
         fused = fuse(found, self._groups, self._vague)
         counts = fused.confidences >= self._confidence
         return fused.take(counts)

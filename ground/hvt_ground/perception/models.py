@@ -209,6 +209,7 @@ class Models:
             head=config.head,
             threads=config.threads,
             provider=config.provider,
+            failures=self.failures,
         )
         return RetriedDetector(open_one, "detector", self.failures)
 

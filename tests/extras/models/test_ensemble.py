@@ -13,8 +13,9 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.labels import declared_class_names, default_confidence, is_calibrated
 from hvt_common.inference.store import parts_of
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import Detections, Image
-from hvt_models.detectors.ensemble import EnsembleDetector, on_scale_of
+from hvt_models.detectors.ensemble import EnsembleDetector, on_scale_of, open_ensemble
 from hvt_models.store import Store
 from media.onnx_models import colour_detector
 
@@ -72,6 +73,28 @@ def test_one_object_gets_one_box_with_the_mean_of_both(
 ) -> None:
     """Every car that two networks know would have two tracks; a rider and the car behind it are two objects."""
     assert merged(Says(AERIAL, *first), Says(STREET, *second)) == together
+
+
+def test_where_one_part_fails_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
+    """A processor that lost its graphics driver showed no box at all, though the other network needed none."""
+
+    class Fails(Says):
+        def detect(self, _: Image) -> Detections:
+            raise RuntimeError("device lost")
+
+    failures = Failures(lambda: 0)
+    parts: dict[str, Says] = {"here": Says(AERIAL, (HERE, 0.6, "car")), "there": Fails(STREET)}
+    opened = {"confidence": 0.1, "failures": failures}
+    both = open_ensemble(lambda part, _: parts[part], dict.fromkeys(parts, 0.25), **opened)
+    found = both.detect(PICTURE)
+    assert found is not None
+    assert found.confidences.tolist() == [pytest.approx(0.6)]
+    assert [(one.part, one.reason) for one in failures.now] == [
+        ("detector there", "RuntimeError: device lost")
+    ]
+    assert "detector there: RuntimeError: device lost; all else goes on" in caplog.text
+    neither = open_ensemble(lambda _part, _: Fails(STREET), dict.fromkeys(parts, 0.25), **opened)
+    assert neither.detect(PICTURE) is None, "that nothing is there is not known"
 
 
 def test_each_part_counts_from_its_own_confidence() -> None:

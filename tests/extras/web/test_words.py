@@ -208,7 +208,8 @@ def test_an_edge_that_sends_no_picture_has_no_green_light():
       wall.refresh(112000, new Set(["uav-2"])); // a ground that was restarted tells of that one alone
       const {{ light, bar }} = wall.card("uav-1");
       wall.leave("uav-1");
-      console.log(JSON.stringify([...seen, [light.dataset.state, bar.ariaValueText], [wall.cards.size, wall.nobody.hidden]]));
+      const left = [wall.cards.size, wall.nobody.hidden];
+      console.log(JSON.stringify([...seen, [light.dataset.state, bar.ariaValueText], left]));
     """)
     silent = ["silent", "no picture 12 s"]
     assert found == [
