@@ -98,7 +98,7 @@ def _ground(units: list[AccessUnit]) -> tuple[float, int]:
         path = Path(folder) / "bench.rrd"
         sink = QueuedSink(
             "recording",
-            lambda: Recorder(_recorder_settings(path, info)),
+            lambda: Recorder(RecorderSettings.of(info, path)),
             failures=Failures(time.time_ns),
             wait_s=10.0,
         )
@@ -142,15 +142,3 @@ def _info() -> Info:
         view_scale=view.scale, view_offset_px=view.offset_px, fps=FPS, codec="hevc", pace="lockstep", method="M0",
         budget_bps=800_000, base_bps=650_000, window_ns=10**9, class_names=("car",), received_ns=0, answered_ns=0,
     )  # fmt: skip
-
-
-def _recorder_settings(path: Path, info: Info) -> RecorderSettings:
-    return RecorderSettings(
-        path=path,
-        edge_id=info.edge,
-        session="1",
-        base_size=info.base_size,
-        fps=info.fps,
-        budget_bps=info.budget_bps,
-        clocked=False,
-    )

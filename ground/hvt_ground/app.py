@@ -17,7 +17,7 @@ import zenoh
 
 from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import Failures, Turns, reason_of
+from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.plug_ins import health_server
 from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
@@ -75,11 +75,8 @@ class _Watcher:
         self._states.put(None)
 
     def _run(self) -> None:
-        part = part_of(self._service)
-        turns = Turns(part, self._failures)
         while (state := self._states.get()) is not None:
-            with turns:
-                self._failures.attempt(part, self._service.show, None, state)
+            self._failures.attempt(part_of(self._service), self._service.show, None, state)
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,14 +55,7 @@ _flight = cache(_new_flight)
 
 
 def _opened(info: Info, reports: ReceiverReports) -> Session:
-    settings = RecorderSettings(
-        path=scratch() / "flight.rrd",
-        edge_id="uav-1",
-        session="77",
-        base_size=info.base_size,
-        fps=info.fps,
-        budget_bps=info.budget_bps,
-    )
+    settings = RecorderSettings.of(info, scratch() / "flight.rrd")
     return Session(
         info,
         sinks=[_sinks.open("recording", lambda: Recorder(settings))],

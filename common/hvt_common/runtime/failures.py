@@ -147,9 +147,10 @@ class Failures:
     def attempt(
         self, part: str, call: Callable[..., _Answer], otherwise: _Other, *arguments: Any
     ) -> _Answer | _Other:
-        """What a part answers that may raise any exception; ``otherwise`` where it does."""
+        """What a part answers that may raise any exception, or hang; ``otherwise`` where it raises."""
         try:
-            answer = call(*arguments)
+            with Turns(part, self, clock=self._clock):
+                answer = call(*arguments)
         except foreign() as error:
             self.failed(part, reason_of(error))
             return otherwise

@@ -105,7 +105,10 @@ class _Content:
             for context in _values(chunk, "AnnotationContext:context"):
                 for one in context[0]:
                     self._names[one["class_id"]] = one["class_description"]["info"]["label"]
-            for ids, classes in zip(_values(chunk, "track_id"), _values(chunk, ":class_ids"), strict=False):
+            now = list(_values(chunk, "class_now")) or _values(
+                chunk, ":class_ids"
+            )  # an early HVT had one of them
+            for ids, classes in zip(_values(chunk, "track_id"), now, strict=False):
                 self._tracks |= dict.fromkeys(zip(ids, classes, strict=False))
         elif path == "/events":
             for text in _values(chunk, "TextLog:text"):

@@ -339,23 +339,14 @@ class SessionFactory:
 
     def _recorder_settings(self, info: Info) -> RecorderSettings:
         config = self.config
-        return RecorderSettings(
-            path=None,
-            edge_id=info.edge,
-            session=f"{info.session_id:08x}",
-            base_size=info.base_size,
-            fps=info.fps,
-            budget_bps=info.budget_bps,
-            facts={
-                "method": info.method,
-                "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
-                "source": f"{info.source_size[0]}x{info.source_size[1]}",
-                "detector": Path(config.detector).name,
-                "classifier": Path(config.classifier or "none").name,
-            },
-            info=info.pack(),
-            clocked=info.pace == "realtime",
-        )
+        facts = {
+            "method": info.method,
+            "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
+            "source": f"{info.source_size[0]}x{info.source_size[1]}",
+            "detector": Path(config.detector).name,
+            "classifier": Path(config.classifier or "none").name,
+        }
+        return RecorderSettings.of(info, None, facts=facts)
 
 
 def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:

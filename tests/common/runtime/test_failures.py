@@ -145,11 +145,17 @@ def test_of_parts_that_hang_in_one_another_the_inner_one_is_said():
     assert "hangs;" in failures.hanging
 
 
-def test_a_part_that_hangs_is_said_until_it_answers(caplog):
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda hang, failures, clock: Retried(lambda: None, "detector", failures, clock=clock).run(hang),
+        lambda hang, failures, _: failures.attempt("detector", hang, None, None),  # as an extra is called
+    ],
+)
+def test_a_part_that_hangs_is_said_until_it_answers(caplog, run):
     """A driver stops answering: there would be no new box, and the status would call all well to the end."""
     clock = Clock(0)
     failures = Failures(clock)
-    detector = Retried(lambda: None, "detector", failures, clock=clock)
 
     def hang(_part):
         seen = []
@@ -159,7 +165,7 @@ def test_a_part_that_hangs_is_said_until_it_answers(caplog):
         assert seen == [[]] * 11 + [["no answer for 10 s"]] * 2
         return "found"
 
-    assert detector.run(hang) == "found"
+    assert run(hang, failures, clock) == "found"
     assert not failures.now
     assert [one.partition(";")[0] for one in caplog.messages] == [
         "detector: no answer for 10 s",

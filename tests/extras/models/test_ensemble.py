@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -84,8 +85,8 @@ def test_where_one_part_fails_the_others_go_on(caplog: pytest.LogCaptureFixture)
 
     failures = Failures(lambda: 0)
     parts: dict[str, Says] = {"here": Says(AERIAL, (HERE, 0.6, "car")), "there": Fails(STREET)}
-    opened = {"confidence": 0.1, "failures": failures}
-    both = open_ensemble(lambda part, _: parts[part], dict.fromkeys(parts, 0.25), **opened)
+    opened = partial(open_ensemble, owns=dict.fromkeys(parts, 0.25), confidence=0.1, failures=failures)
+    both = opened(lambda part, _: parts[part])
     found = both.detect(PICTURE)
     assert found is not None
     assert found.confidences.tolist() == [pytest.approx(0.6)]
@@ -93,7 +94,7 @@ def test_where_one_part_fails_the_others_go_on(caplog: pytest.LogCaptureFixture)
         ("detector there", "RuntimeError: device lost")
     ]
     assert "detector there: RuntimeError: device lost; all else goes on" in caplog.text
-    neither = open_ensemble(lambda _part, _: Fails(STREET), dict.fromkeys(parts, 0.25), **opened)
+    neither = opened(lambda _part, _: Fails(STREET))
     assert neither.detect(PICTURE) is None, "that nothing is there is not known"
 
 

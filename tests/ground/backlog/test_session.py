@@ -37,10 +37,10 @@ from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.event_tables import SessionTiming, timing_table
-from hvt_ground.sinks.rerun.recorder import Recorder
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import SLOTS
 from programs.processes import eventually
-from programs.rrd import Recording, settings_of
+from programs.rrd import Recording
 from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.examples import overlay, seen
@@ -95,7 +95,7 @@ class Rig(ReceiverRig):
         return BacklogRecording(info, sink=self._sink(info, path), perception=StoredPerception(info))
 
     def _sink(self, info: Info, path: Path) -> QueuedSink:
-        made = settings_of(info, path, **self._recorder)
+        made = RecorderSettings.of(info, path, **self._recorder)
         return self.outputs.open("recording", lambda: Recorder(made))
 
     def put(self, *items: Received) -> None:
@@ -489,7 +489,7 @@ def test_a_recording_in_use_stays_open(flight, tmp_path):
 
     def open_one(info: Info) -> BacklogRecording:
         path = tmp_path / f"{len(made)}.rrd"
-        sink = outputs.open("recording", lambda: Recorder(settings_of(info, path)))
+        sink = outputs.open("recording", lambda: Recorder(RecorderSettings.of(info, path)))
         made.append(BacklogRecording(info, sink=sink, perception=StoredPerception(info)))
         return made[-1]
 

@@ -52,7 +52,7 @@ class Ground:
         self.sessions = EdgeSessions(self.port, open_session=self.open_one, on_ended=self.ended.append)
 
     def open_one(self, info: Info, reports: ReceiverReports) -> Session:
-        settings = RecorderSettings(self.path, info.edge, "1", info.base_size, info.fps, info.budget_bps)
+        settings = RecorderSettings.of(info, self.path)
         gone = replace(settings, path=self.path / "no" / "folder.rrd")
         sinks = [
             self.outputs.open("recording of uav-1", lambda: Recorder(settings), for_backlog=True),

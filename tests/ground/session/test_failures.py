@@ -22,9 +22,9 @@ from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.rerun.recorder import Recorder
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from programs.processes import eventually
-from programs.rrd import Recording, settings_of
+from programs.rrd import Recording
 from rigs.flight import Flight, Port, pipeline_of
 from rigs.handled import WatchedInbox
 
@@ -60,7 +60,7 @@ class Consumer:
         if self.broken == "opening":
             raise OSError(28, "No space left on device", "a.rrd")
         path = self.folder / f"{info.edge}-{len(self.sessions)}.rrd"
-        settings = settings_of(info, path)
+        settings = RecorderSettings.of(info, path)
         sink = QueuedSink("recording", lambda: Recorder(settings), failures=Failures(time.time_ns))
         session = Session(
             info,

@@ -12,7 +12,6 @@ from typing import Any
 
 from rerun.chunk import Chunk, RrdReader
 
-from hvt_common.protocol.messages import Info
 from hvt_ground.events import Event
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 
@@ -40,11 +39,6 @@ class ReadBox:
 def settings(path: Path | None, **changes: Any) -> RecorderSettings:
     small = RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0, {"method": "M5"})
     return replace(small, **changes)
-
-
-def settings_of(info: Info, path: Path, **changes: Any) -> RecorderSettings:
-    session = f"{info.session_id:08x}"
-    return RecorderSettings(path, info.edge, session, info.base_size, info.fps, info.budget_bps, **changes)
 
 
 def recorded(path: Path, events: Iterable[Event], **changes: Any) -> Path:

@@ -10,12 +10,13 @@ import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
+from hvt_common.protocol.messages import Info
 from hvt_common.units import bitrate_text
 from hvt_common.video.hevc import parameter_sets
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
@@ -83,6 +84,13 @@ class RecorderSettings:
     """Where a viewer listens (`LiveView.url`) that shows it in place of a file."""
     compact_bytes: int = 3 << 19
     """Payload of the append log at which it is compacted: that costs some 50 kB, and this much is in memory."""
+
+    @classmethod
+    def of(cls, info: Info, path: Path | None, **more: Any) -> Self:
+        """Those of a session."""
+        given: dict[str, Any] = {"info": info.pack(), "clocked": info.pace == "realtime", **more}
+        session = f"{info.session_id:08x}"
+        return cls(path, info.edge, session, info.base_size, info.fps, info.budget_bps, **given)
 
 
 class Recorder(SinkWriter[Event]):

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
 
+import numpy as np
 import pyarrow as pa
 import pytest
 import rerun as rr
@@ -28,7 +29,7 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.clock import boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import Limit
-from hvt_ground.events import Event, Refinement, VideoSample
+from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks import QueuedSink
@@ -48,9 +49,15 @@ ALL = Retention()
 
 @pytest.fixture(scope="module")
 def events() -> list[Event]:
-    """Four seconds: two files."""
+    """Four seconds: two files; a truck is called a vehicle."""
     drawn = drawn_frames(FRAMES)
-    return [one for one, _ in session(drawn, coded(drawn, kbps=200, keyint=10), tracks=6, total_kbps=400)]
+    made = [one for one, _ in session(drawn, coded(drawn, kbps=200, keyint=10), tracks=6, total_kbps=400)]
+    return [
+        replace(one, vague=np.array([name == "truck" for name in one.classes]))
+        if isinstance(one, Overlay)
+        else one
+        for one in made
+    ]
 
 
 def settings(folder: Path) -> RecorderSettings:
