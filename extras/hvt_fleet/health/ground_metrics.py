@@ -45,7 +45,7 @@ _GAUGES: Table[SessionState] = {
     ),
     "hvt_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
     "hvt_tracks_refined": ("Of these, refined by a still.", lambda one: one.tracks_refined),
-    "hvt_tracks_doubted": ("Shown, and doubted by stills.", lambda one: one.tracks_doubted),
+    "hvt_tracks_doubted": ("Shown, and doubted.", lambda one: one.tracks_doubted),
     "hvt_view_trust_ratio": (
         "Trust of the ground's detector in the view, 0 to 1.",
         lambda one: one.view_trust,

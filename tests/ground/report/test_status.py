@@ -272,6 +272,11 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
     nobody = EdgeSessions(Port(), open_session=ground.open_one)
     (waiting,) = maker.make([("uav-2", nobody)]).edges
     assert (waiting.link, waiting.session) == ("waiting", None)
+    ground.end()
+    links = [StateMaker(time.time_ns, cut=cut).make([("uav-1", ground.sessions)]) for cut in (False, True)]
+    assert [one.edges[0].link for one in links] == ["ended", "lost"], (
+        "a ground without a link said that flights ended"
+    )
 
 
 def test_an_edge_that_leaves_frames_out_is_on_a_thin_link(ground):
