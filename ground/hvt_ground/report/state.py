@@ -258,7 +258,7 @@ class StateMaker:
     loading: Callable[[], bool] = lambda: False
     recorded: bool = True
     group: Group | None = None
-    cut: bool = False
+    disconnected: bool = False
     """The ground has no link: sessions that it closed for that have not ended at their edges."""
 
     def __post_init__(self) -> None:
@@ -308,7 +308,7 @@ class StateMaker:
 
     def _link(self, edge: str, sessions: EdgeSessions, session: Session | None, now_ns: int) -> LinkState:
         if session is None:
-            return ("lost" if self.cut else "ended") if sessions.ended else "waiting"
+            return ("lost" if self.disconnected else "ended") if sessions.ended else "waiting"
         if sessions.receiver.silent_ns > LOST_NS and not session.lockstep:
             return "lost"
         left_out = _left_out(session.reception.last_status)

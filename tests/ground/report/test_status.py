@@ -273,7 +273,9 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
     (waiting,) = maker.make([("uav-2", nobody)]).edges
     assert (waiting.link, waiting.session) == ("waiting", None)
     ground.end()
-    links = [StateMaker(time.time_ns, cut=cut).make([("uav-1", ground.sessions)]) for cut in (False, True)]
+    links = [
+        StateMaker(time.time_ns, disconnected=one).make([("uav-1", ground.sessions)]) for one in (False, True)
+    ]
     assert [one.edges[0].link for one in links] == ["ended", "lost"], (
         "a ground without a link said that flights ended"
     )
