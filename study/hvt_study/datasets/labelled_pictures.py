@@ -84,7 +84,7 @@ class LabelledPicture:
                 self.doubts.leave_out(f"{where} has no class")
             elif box is None or not all(map(math.isfinite, box)):
                 self.doubts.leave_out(
-                    f"{where} has no box of four numbers; x, y, w, h in the picture of {size[0]}x{size[1]} do"
+                    f"{where} has no box: accepted are four numbers in the picture of {size[0]}x{size[1]}"
                 )
             else:
                 good.append((name, box, where))
@@ -273,7 +273,7 @@ def _coco_row(row: Mapping[str, Any]) -> _Annotation:
     box = row.get("bbox")
     name = "ignore" if _id(row.get("iscrowd")) or _id(row.get("ignore")) else str(row["name"])
     if not (isinstance(box, list) and len(box) == 4 and all(map(_is_number, box))):
-        return name, None, f"{row['where']} has the box {box}: it"
+        return name, None, f"{row['where']}, bbox {box},"
     x, y, wide, high = box
     return name, (x, y, x + wide, y + high), str(row["where"])
 

@@ -213,11 +213,11 @@ def test_one_bad_row_costs_itself_alone(tmp_path):
         ([-0.5, 10, 20, 20], [BOX, [0, 10, 19.5, 30]], "COCO annotation 1 of labels.json, by 0.5 px"),
         ([190, 90, 20, 20], [BOX, [190, 90, 200, 100]], "by 10 px"),
         ([500, 90, 20, 20], [BOX], "1 labels were left out; the first: COCO annotation 1"),
-        ([1, 2, 3], [BOX], "has the box [1, 2, 3]"),
-        ([float("nan"), 1, 2, 3], [BOX], "has the box [nan, 1, 2, 3]: it has no box of four numbers"),
-        ([10**400, 1, 2, 3], [BOX], "has the box [1000"),
+        ([1, 2, 3], [BOX], "bbox [1, 2, 3], has no box"),
+        ([float("nan"), 1, 2, 3], [BOX], "bbox [nan, 1, 2, 3], has no box"),
+        ([10**400, 1, 2, 3], [BOX], "bbox [1000"),
         ([5, 5, -2, 4], [BOX], "has a box outside the picture of 200x100, or without area"),
-        ("none", [BOX], "has the box none: it has no box of four numbers"),
+        ("none", [BOX], "bbox none, has no box: accepted are"),
     ],
 )
 def test_boxes_of_coco_are_cut_at_the_picture(tmp_path, box, boxes, words):
