@@ -53,7 +53,7 @@ def test_a_network_runs_below_everything_else(tmp_path, threads):
     for one in started:
         with contextlib.suppress(OSError):  # ours of a moment ago
             levels.add(os.getpriority(os.PRIO_PROCESS, int(one)))
-    assert levels == {11} or (threads == 1 and not levels), "perception has a thread already"
+    assert levels == {max(11, own)} or (threads == 1 and not levels), "perception has a thread already"
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == own
 
 
