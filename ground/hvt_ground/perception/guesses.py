@@ -21,10 +21,10 @@ from hvt_common.values import Boxes, Tracks
 from hvt_ground.events import Refinement
 from hvt_ground.perception.stills.posterior import LEAST_SURE_PX, SURE
 
-_LIKELY, _LIKELY_ODD = 0.5, 0.65
+_LIKELY, _LIKELY_ODD = 0.5, 0.7
 """From this mean confidence on it is more likely right than not; a person, one much larger than others or on one."""
-_AGREED = {"car": 0.6}
-_AGREED_ELSE = 0.85
+_AGREED = {"car": 0.65}
+_AGREED_ELSE = 0.94
 """From this mean confidence on, 0 where it was called another kind, nine of ten are right (embedded-models.md)."""
 _REACH, _NOISE_PX = 0.5, 4.0
 """It has moved when its middle is half its longer side, and 4 pixels, from where it stood."""

@@ -167,7 +167,7 @@ class ExportedDetector(nn.Module):
         best = classes.amax(dim=2, keepdim=True)
         score = (objectness * best).clamp(1e-6, 1 - 1e-6)
         true = (self.slope * (score / (1 - score)).log() + self.shift).sigmoid()
-        return torch.cat([rows[..., :4], (true / best).clamp(max=1.0), classes], dim=2)
+        return torch.cat([rows[..., :4], true, classes / best], dim=2)
 
 
 def _doubled(x: Tensor) -> Tensor:

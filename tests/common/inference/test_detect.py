@@ -322,6 +322,26 @@ def test_what_both_networks_of_a_file_see_is_surer(tmp_path):
         np.testing.assert_allclose(found.confidences, expected, rtol=1e-5)
 
 
+def test_what_floats_to_the_second_network_makes_a_boat_of_the_firsts_vehicle(tmp_path):
+    """A boat from above is a car to one network and a kite to the other; so is a swimmer, who is no boat."""
+    grid = cells((64, 64), (8, 16, 32, 16, 32, 64))
+    names = {"names": str({0: "car", 1: "boat", 2: "pedestrian"})}
+    for kind, floats_at, expected in ((0, 20, 1), (0, 60, 0), (2, 20, 2)):
+        table = empty(len(grid), 8)
+        for row, centre, said, score in ((84 - 20, 20, kind, 0.8), (84, floats_at, 1, 0.9)):
+            x, y, stride = grid[row]
+            table[0, row, :5] = [
+                centre / stride - x,
+                20 / stride - y,
+                *np.log([20 / stride, 10 / stride]),
+                score,
+            ]
+            table[0, row, 5 + said] = 1
+        found = found_in(tmp_path, table, metadata=OURS | names, confidence=0.4)
+        assert found.class_ids.tolist() == [expected]
+        np.testing.assert_allclose(found.confidences, [0.8], rtol=1e-5)
+
+
 def test_crowds_survive_up_to_the_cap():
     """A crowd of people or a full car park would be thinned out."""
     x, y = np.meshgrid(np.arange(50.0), np.arange(40.0))
@@ -380,9 +400,19 @@ def test_a_network_for_small_objects_has_small_images_enlarged(tmp_path, monkeyp
     inputs: list[tuple[int, ...]] = []
     run = detector.model.run
     monkeypatch.setattr(detector.model, "run", lambda *given: inputs.append(given[0].shape) or run(*given))
-    thermal, coloured = (detector.detect(np.full((512, 640, 3), (90, 90, red), np.uint8)) for red in (90, 92))
+    left = np.zeros((512, 640, 3), np.uint8)
+    left[:, :320] = 90
+    thermal, coloured = (detector.detect(image) for image in (left, np.full_like(left, (90, 90, 92))))
     assert inputs == [(1, 3, 672, 832), (1, 3, 512, 640), (1, 3, 1024, 1280)]
-    assert len(thermal) > len(coloured) == 0, "90 of 255 is .35, and agreed .47"
+    assert len(coloured) == 0
+    assert thermal.boxes_xyxy_px[:, 2].max() < 330
+    people = metadata | {"names": str(dict.fromkeys(range(3), "person"))}
+    warm = open_detector(
+        str(colour_detector(path, "yolox", size=None, metadata=people)), confidence=0.4
+    ).detect(left)
+    for found, agreed in ((thermal, 0.5), (warm, 0.5 + 0.25)):
+        expected = 90 / (90 + 165 * np.exp(-agreed))  # 90 of 255 alone is .35
+        np.testing.assert_allclose(found.confidences.max(), expected, rtol=1e-4)
     image = np.zeros((64, 96, 3), np.uint8)
     image[16:24, 40:48] = (0, 255, 0)
     found = open_detector(str(path), confidence=0.9).detect(image)

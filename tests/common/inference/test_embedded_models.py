@@ -50,6 +50,13 @@ def test_the_names_are_those_of_the_scene():
     assert open_classifier(EMBEDDED_CLASSIFIER).class_names == Scene.class_names
 
 
+def test_a_score_is_the_calibrated_one_whatever_the_class():
+    """Of vehicles that were .87 sure .98 were right: the class's share was the most that a score could be."""
+    answer = open_model(embedded_models()[EMBEDDED_DETECTOR]).run(np.full((1, 3, 64, 64), 90, np.float32))[0]
+    own = answer[0, : 8 * 8 + 4 * 4 + 2 * 2]
+    np.testing.assert_allclose(own[:, 5:].max(axis=1), 1, rtol=1e-4)
+
+
 def test_any_picture_size_goes_in():
     """A camera of another shape would end in an error of the runtime."""
     detector = open_detector(EMBEDDED_DETECTOR)

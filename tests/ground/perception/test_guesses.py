@@ -38,7 +38,7 @@ def guessed(things: list[Thing], *, moves_px: float = 0.0) -> list[int]:
 ROW: list[Thing] = [("car", 0.8, (100.0 * one, 200.0), 90.0) for one in range(5)]
 POST: Thing = ("pedestrian", 0.44, (900.0, 400.0), 12.0)
 PIT: Thing = ("pedestrian", 0.55, (900.0, 400.0), 12.0)
-WAITS: Thing = ("pedestrian", 0.7, (930.0, 400.0), 12.0)
+WAITS: Thing = ("pedestrian", 0.75, (930.0, 400.0), 12.0)
 PLANTER: Thing = ("bus", 0.43, (500.0, 60.0), 216.0)
 FAINT: Thing = ("van", 0.35, (500.0, 500.0), 80.0)
 HALF: Thing = ("van", 0.6, (125.0, 200.0), 40.0)
@@ -92,7 +92,7 @@ def test_a_kind_is_known_where_detections_agree_on_it(said, aslant, known):
     """A parked car was a truck in one second and a car in the next, each as firm as a car that never was another."""
     guesses = Guesses(fps=10)
     for frame, name in enumerate(said):
-        guesses.update(tracks(frame, [(name, 0.87, (500.0, 400.0), 30.0)]), [name], None)
+        guesses.update(tracks(frame, [(name, 0.95, (500.0, 400.0), 30.0)]), [name], None)
     assert guesses.agreed(np.array([1]), said[-1:], aslant=aslant).tolist() == [known]
     assert not guesses.agreed(np.array([2]), said[-1:], aslant=aslant).any(), "one that was never seen"
 
