@@ -5,12 +5,11 @@ The file has one input and one YOLOX head, as each of them has; to a program it 
 
 YOLOX-nano (Ge et al., 2021; Megvii, Apache-2.0) knows objects of some size at eye level and aslant. It gets the
 picture at half, where it costs four tenths of the aerial network, and its cells stand behind the
-aerial ones: strides of 16, 32 and 64 pixels. Four rules keep it to its views:
+aerial ones: strides of 16, 32 and 64 pixels. Three rules keep it to its views:
 
 * its objectness is raised, so that a box that its authors' program shows (from .3) counts here (``hvt.confidence``);
 * a picture without colour is thermal, or of the night: there it sees people who are not there, and is not heard;
-* a box around nearly the whole picture is no object;
-* a "kite" is our boat, which only renames a vehicle of the aerial network (`hvt_common.inference.detect`).
+* a box around nearly the whole picture is no object.
 """
 
 from pathlib import Path
@@ -35,7 +34,6 @@ _COCO_OF = {
     **{name: name for name in ("car", "truck", "bus", "bicycle")},
     "motor": "motorcycle",
     "pedestrian": "person",
-    "boat": "kite",
 }
 
 # The picture, in grey (as the letterbox's border) to multiples of 64, at half: multiples of 32.

@@ -3,11 +3,9 @@
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -25,12 +23,12 @@ from hvt_common.inference.labels import (
     read_labels,
 )
 from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr, prepared_as, without_palette
-from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, raised, suppress
+from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model, own_steps
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
 from hvt_common.runtime.failures import Failures
-from hvt_common.values import Detections, Image, iou
+from hvt_common.values import Detections, Image
 
 _log = logging.getLogger(__name__)
 
@@ -49,14 +47,7 @@ _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
 _THERMAL_SHARE, _SECOND_SHARE = 0.65, 0.76
 """A small picture without colour is enlarged to this share of that side: larger, 640x512 shows people that are none.
-The second network of a file is silent there; a second run, mirrored and at this share of the size, agrees instead
-(`averaged`).
-"""
-_THERMAL_PEOPLE = 0.25
-"""Of the logit; chosen on training pictures, where F1 is the same from a confidence of .32 to .45."""
-_ON_BOAT = 0.5
-"""COCO has no view from above: to the second network of a file a boat there is a "kite", and so is a swimmer. It only
-tells that a vehicle of the first one, which overlaps it so much, is a boat.
+The second network of a file is silent there; a second run, at this share of the size, agrees instead (`averaged`).
 """
 _BROKEN = 0.1
 """Where no more of an answer is no number, that is some cells; the scores of one class are a fifth."""
@@ -259,15 +250,8 @@ class OnnxDetector:
             self.input_size(size, share=share * part, thermal=thermal) for part in (1.0, _SECOND_SHARE)
         )
         found, letterbox = self._candidates(image, whole, least)
-        boats = None
         if thermal and smaller != whole and self._averages and self.head.suppresses:
-            mirrored = np.asarray(cv2.flip(image, 1), np.uint8)
-            found = _joined(found, letterbox, *self._candidates(mirrored, smaller, least))
-            people = self._are(found.class_ids, "person")
-            found = replace(found, scores=raised(found.scores, _THERMAL_PEOPLE * people))
-        elif found.second is not None:
-            afloat = found.second & self._are(found.class_ids, "boat")
-            boats, found = found.take(afloat), found.take(~afloat)
+            found = _joined(found, letterbox, *self._candidates(image, smaller, least))
         if self.head.suppresses:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids
@@ -279,11 +263,8 @@ class OnnxDetector:
             boxes, scores = averaged(*candidates, selected, iou=self._nms_iou, second=found.second)
             best = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores >= self._confidence)]
             boxes, scores, selected = boxes[best], scores[best], selected[best]
-        class_ids = found.class_ids[selected]
-        if boats is not None and len(boats.scores):
-            on = (iou(boxes, boats.boxes_input_px) >= _ON_BOAT).any(axis=1)
-            class_ids[on & self._are(class_ids, "vehicle")] = boats.class_ids[0]
         boxes = letterbox.to_image(boxes)
+        class_ids = found.class_ids[selected]
         named = class_ids < len(self.class_names)
         if self._are_names and not named.all() and counts_from_one(self.head.name):
             raise UserError(
@@ -300,10 +281,6 @@ class OnnxDetector:
             )
         inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & named
         return Detections(boxes[inside], scores[inside], class_ids[inside])
-
-    def _are(self, class_ids: npt.NDArray[np.int32], group: str) -> npt.NDArray[np.bool_]:
-        ids = [row for row, name in enumerate(self.class_names) if group_of(name) == group]
-        return np.isin(class_ids, ids)
 
     def _candidates(
         self, image: Image, input_size: tuple[int, int], least: float
@@ -401,11 +378,9 @@ class OnnxDetector:
 
 
 def _joined(a: HeadOutput, a_lies: Letterbox, b: HeadOutput, b_lies: Letterbox) -> HeadOutput:
-    # Two looks at one picture, the other mirrored: boxes in the pixels of the first, ``second`` tells the other's.
+    # Two looks at one picture: boxes in the pixels of the first, ``second`` tells those of the other.
     (a_corner, a_size), (b_corner, b_size) = (np.array(one.content).reshape(2, 2) for one in (a_lies, b_lies))
-    boxes = (b.boxes_input_px.reshape(-1, 2, 2) - b_corner) / b_size
-    boxes[..., 0] = 1 - boxes[:, ::-1, 0]
-    boxes = boxes * a_size + a_corner
+    boxes = (b.boxes_input_px.reshape(-1, 2, 2) - b_corner) * (a_size / b_size) + a_corner
     return HeadOutput(
         np.concatenate([a.boxes_input_px, boxes.reshape(-1, 4).astype(np.float32)]),
         np.concatenate([a.scores, b.scores]),

@@ -89,19 +89,15 @@ def averaged(
     sums = [np.bincount(rows, weights * side, len(selected)) for side in (*b, np.ones(len(rows)))]
     known = sums[4] > 0  # a box without an area overlaps nothing, itself neither
     boxes = np.where(known, np.array(sums[:4]) / np.where(known, sums[4], 1), selected_px).T
-    said = scores[selected]
+    said = scores[selected].astype(np.float64)
     if second is not None:
         agree = (shared >= _AGREE_IOU * united) & (scores[columns] >= WEAK)
         both = [
             np.bincount(rows, agree & (second[columns] == one), len(selected)) > 0 for one in (False, True)
         ]
-        said = raised(said, np.where(both[0] & both[1], _AGREED, 0))
-    return boxes.astype(np.float32), said
-
-
-def raised(scores: npt.NDArray[np.floating], by: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-    """(N,) scores, 0…1, whose logits are greater by (N,) ``by``."""
-    return np.asarray(scores / (scores + (1 - scores) * np.exp(-by)), np.float32)
+        raised = said / (said + (1 - said) * np.exp(-_AGREED))
+        said = np.where(both[0] & both[1], raised, said)
+    return boxes.astype(np.float32), said.astype(np.float32)
 
 
 def _greedy(rects: npt.NDArray[np.float64], iou: float) -> npt.NDArray[np.intp]:

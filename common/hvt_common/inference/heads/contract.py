@@ -32,13 +32,6 @@ class HeadOutput:
     beyond: bool = False
     """Boxes with a score above 1 were left out: that is no probability."""
 
-    def take(self, wanted: npt.NDArray[np.bool_]) -> "HeadOutput":
-        """Those of (N,) ``wanted``."""
-        second = None if self.second is None else self.second[wanted]
-        return HeadOutput(
-            self.boxes_input_px[wanted], self.scores[wanted], self.class_ids[wanted], second, self.beyond
-        )
-
 
 class Decoder(Protocol):
     """Numbers to boxes."""
