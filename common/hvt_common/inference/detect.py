@@ -159,14 +159,15 @@ def detect_still_every(given: int | None, *, fps: float) -> int:
     return given or max(detect_every(None, fps=fps), round(fps))
 
 
-def warm_up(detector: FailingDetector, size: tuple[int, int]) -> None:
+def warm_up(detector: FailingDetector, size: tuple[int, int]) -> bool:
     """Run a network once at the (width, height) it will get: a runtime may compile for it, which takes 0.2 s.
 
-    The motion detector, which remembers pictures, is left alone.
+    Returns whether it works. The motion detector, which remembers pictures, is left alone.
     """
     motion = library_part(MOTION)
-    if motion is None or not isinstance(detector, motion):
-        detector.detect(np.full((size[1], size[0], 3), (9, 0, 0), np.uint8))
+    return (motion is not None and isinstance(detector, motion)) or detector.detect(
+        np.full((size[1], size[0], 3), (9, 0, 0), np.uint8)
+    ) is not None
 
 
 class OnnxDetector:

@@ -164,7 +164,7 @@ class StatusReporter:
             ),
             failed=tuple(
                 FailedPart(
-                    part=one.part[:_PART_BYTES],
+                    part=fitted_text(one.part, _PART_BYTES),
                     reason=fitted_text(one.reason, _REASON_BYTES),
                     failures=one.count,
                     failed_ns=one.failed_ns,

@@ -28,7 +28,7 @@ from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
 from hvt_common.inference.tiles import parse_tiles, searches_scale, tiled
 from hvt_common.inference.view_trust import ViewTrust
-from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View
@@ -92,13 +92,24 @@ def unopened(config: EdgeConfig, open_detector: Callable[[], Detector]) -> Detec
 
 
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
-    """Run the detector once on a picture of the flight's shape: a runtime may compile for each shape."""
+    """Run the detector once on a picture of the flight's shape: a runtime may compile for each shape.
+
+    Raises `UserError` where it does not run.
+    """
     if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
         _log.warning("%s", uncalibrated("detector", config.detector))
-    if config.candidates == "source":
-        warm_up(detector, view.base_size if view.enlarges else view.source_size)
-    else:
-        warm_up(detector, view.base_size)
+    whole = config.candidates == "source" and not view.enlarges
+    try:
+        works, why = (
+            warm_up(detector, view.source_size if whole else view.base_size),
+            "none of its networks does",
+        )
+    except UserError:
+        raise
+    except foreign() as error:
+        works, why = False, reason_of(error)
+    if not works:
+        raise UserError(f"detector {config.detector} does not run: {why}; choose another with --detector")
 
 
 def make_analyzer(

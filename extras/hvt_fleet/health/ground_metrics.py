@@ -8,8 +8,7 @@ from functools import partial
 
 from prometheus_client.core import Metric
 
-from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.edge_words import STILL_WORDS
+from hvt_common.protocol.edge_words import PART_WORDS, STILL_WORDS
 from hvt_common.units import SECOND_NS
 from hvt_fleet.health import server
 from hvt_fleet.health.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
@@ -19,12 +18,7 @@ _LINKS = ("waiting", "up", "thin", "lost", "ended")
 _OTHER = "other"
 """A word of the edge's that is none of these: each new one would be a series for ever."""
 _REASONS = frozenset(STILL_WORDS)
-_EDGE_PARTS = frozenset(
-    (
-        *("source", "encoder", "video", "passthrough", "local copy", "stills", "requested stills", "reports"),
-        *("pose", "store", "backlog", "detector", "metrics", "listener", "flight", *map(str, Channel)),
-    )
-)
+_EDGE_PARTS = frozenset(PART_WORDS)
 
 _GAUGES: Table[SessionState] = {
     "hvt_budget_bits_per_second": ("The edge's budget.", lambda one: one.budget_bps),

@@ -25,6 +25,8 @@ _SAME_IOU = 0.55
 """The paper's."""
 _VAGUE_VOTE = 1e-6
 _LEAST_WEIGHT = 1e-9
+_PART_NAMES = ("detector 1", "detector 2", "detector 3")
+"""As they are named to grounds: a path is private, too long for the wire, and no label of a metric."""
 
 
 def on_scale_of(confidences: npt.NDArray[np.float32], own: float, wanted: float) -> npt.NDArray[np.float32]:
@@ -53,22 +55,28 @@ def open_ensemble(
     """
     first, least = next(iter(owns.values())), np.array([confidence], np.float32)
     parts: list[FailingDetector] = []
-    for part, own in owns.items():
+    for name, (part, own) in zip(_PART_NAMES, owns.items(), strict=False):
         open_one = partial(opened, part, float(on_scale_of(least, first, own)[0]))
-        parts.append(
-            open_one() if failures is None else RetriedDetector(open_one, f"detector {part}", failures)
-        )
-    return EnsembleDetector(parts, list(owns.values()), confidence=confidence)
+        parts.append(open_one() if failures is None else RetriedDetector(open_one, name, failures))
+    return EnsembleDetector(parts, list(owns.values()), confidence=confidence, failures=failures)
 
 
 class EnsembleDetector:
     """Two or three detectors, itself one; ``owns`` are their confidences of use, the first the ensemble's.
 
     Its class names are those of all parts; a kind has the word of the first part that knows it. ``confidence`` is the
-    least of a detection.
+    least of a detection. ``failures`` lists it while all its parts fail.
     """
 
-    def __init__(self, parts: Sequence[FailingDetector], owns: Sequence[float], *, confidence: float) -> None:
+    def __init__(
+        self,
+        parts: Sequence[FailingDetector],
+        owns: Sequence[float],
+        *,
+        confidence: float,
+        failures: Failures | None = None,
+    ) -> None:
+        self._failures, self._failed = failures, False
         self._parts, self._owns, self._confidence = tuple(parts), tuple(owns), confidence
         names: list[str] = list(parts[0].class_names)
         kinds = [kind_of(name) for name in names]
@@ -92,6 +100,12 @@ class EnsembleDetector:
                 continue
             sure = on_scale_of(one.confidences, own, self._owns[0])
             found.append(Detections(one.boxes_xyxy_px, sure, ids[one.class_ids]))
+        if self._failures is not None and self._failed != (not found):
+            self._failed = not found
+            if found:
+                self._failures.works("detector")
+            else:
+                self._failures.failed("detector", "none of its networks works")
         if not found:
             return None
         fused = fuse(found, self._groups, self._vague)

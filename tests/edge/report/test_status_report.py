@@ -36,8 +36,8 @@ def test_a_camera_that_was_away_makes_no_boxes_new_and_no_detector_slow(newest_n
     assert boxes_age_s(10 * S, **times) == found
 
 
-def test_numbers_that_a_report_cannot_say_end_no_flight():
-    """A camera that no ground has heard for 50 days would end, and so would one whose first detection hangs."""
+def test_what_a_report_cannot_say_ends_no_flight():
+    """A camera that no ground has heard for 50 days would end, or one with a part whose name is not ASCII."""
     sent: list[bytes] = []
     state: Any = SimpleNamespace(
         state="running",
@@ -69,7 +69,9 @@ def test_numbers_that_a_report_cannot_say_end_no_flight():
         failures=Failures(lambda: 0),
         loop_clock=lambda: 0,
     )
+    heartbeat.failures.failed("камера на крыле", "gone")
     StatusReporter(heartbeat).send("running")
+    assert Status.parse(sent[0]).failed[0].part == "камера на кры"
     health = Status.parse(sent[0]).health
     assert (health.encode_ms, health.detect_ms, health.feedback_age_ms) == (60_000, 60_000, 2**32 - 1)
 

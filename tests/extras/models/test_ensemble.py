@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +18,7 @@ from hvt_common.inference.labels import declared_class_names, default_confidence
 from hvt_common.inference.store import parts_of
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Detections, Image
+from hvt_edge.wiring import warm_up_for
 from hvt_models.detectors.ensemble import EnsembleDetector, on_scale_of, open_ensemble
 from hvt_models.store import Store
 from media.onnx_models import colour_detector
@@ -84,18 +87,33 @@ def test_where_one_part_fails_the_others_go_on(caplog: pytest.LogCaptureFixture)
             raise RuntimeError("device lost")
 
     failures = Failures(lambda: 0)
-    parts: dict[str, Says] = {"here": Says(AERIAL, (HERE, 0.6, "car")), "there": Fails(STREET)}
+    parts: dict[str, Says] = {
+        "/here/a.onnx": Says(AERIAL, (HERE, 0.6, "car")),
+        "/there/b.onnx": Fails(STREET),
+    }
     opened = partial(open_ensemble, owns=dict.fromkeys(parts, 0.25), confidence=0.1, failures=failures)
     both = opened(lambda part, _: parts[part])
     found = both.detect(PICTURE)
     assert found is not None
     assert found.confidences.tolist() == [pytest.approx(0.6)]
-    assert [(one.part, one.reason) for one in failures.now] == [
-        ("detector there", "RuntimeError: device lost")
-    ]
-    assert "detector there: RuntimeError: device lost; all else goes on" in caplog.text
+    assert [(one.part, one.reason) for one in failures.now] == [("detector 2", "RuntimeError: device lost")]
+    assert "detector 2: RuntimeError: device lost; all else goes on" in caplog.text
     neither = opened(lambda _part, _: Fails(STREET))
     assert neither.detect(PICTURE) is None, "that nothing is there is not known"
+    assert "detector" in {one.part for one in failures.now}, (
+        "a ground would not hear that nothing is detected"
+    )
+    config: Any = SimpleNamespace(detector="aerial-nano", candidates="decoded")
+    view: Any = SimpleNamespace(base_size=(64, 64), source_size=(64, 64), enlarges=False)
+    warm_up_for(config, both, view)
+    for one, why in ((neither, "none of its networks does"), (Fails(STREET), "RuntimeError: device lost")):
+        with pytest.raises(UserError, match=f"detector aerial-nano does not run: {why}; choose another"):
+            warm_up_for(config, one, view)
+    answers = [found, None]
+    back: Any = SimpleNamespace(class_names=AERIAL, detect=lambda _: answers.pop())
+    back = EnsembleDetector([back], [0.25], confidence=0.1, failures=failures)
+    assert [back.detect(PICTURE) is None, back.detect(PICTURE) is None] == [True, False]
+    assert "detector" not in {one.part for one in failures.now}
 
 
 def test_each_part_counts_from_its_own_confidence() -> None:

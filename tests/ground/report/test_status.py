@@ -325,7 +325,12 @@ def test_words_of_an_edge_do_not_become_series_without_end(ground):
     """Each new reason or part that a hostile edge names would stay in the database of whoever watches."""
     evil = FailedPart(part="evil", reason="x", failures=1, failed_ns=1, working=False)
     deferred = {f"evil {n}": 1 for n in range(20)} | {"base_good": 5}
-    failed = (evil, replace(evil, part="evil 2"), replace(evil, part="encoder"))
+    failed = (
+        evil,
+        replace(evil, part="evil 2"),
+        replace(evil, part="encoder"),
+        replace(evil, part="detector 2"),
+    )
     ground.report(lambda status: replace(status, sequence=9, deferred=deferred, failed=failed))
     text = ground.metrics()
     ground.end()
@@ -335,6 +340,7 @@ def test_words_of_an_edge_do_not_become_series_without_end(ground):
         'hvt_stills_not_sent_total{edge="uav-1",reason="base_good"} 5.0',
         'hvt_part_failed{edge="uav-1",part="other"} 1.0',
         'hvt_part_failed{edge="uav-1",part="encoder"} 1.0',
+        'hvt_part_failed{edge="uav-1",part="detector 2"} 1.0',
     ):
         assert line in text
 
