@@ -12,6 +12,7 @@ import pytest
 import hvt_edge.cli
 from hvt_common.config import load
 from hvt_common.errors import UserError
+from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.store import library_part
@@ -25,6 +26,7 @@ from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import all_extras, config_class, locators
 from hvt_ground.poses import NOWHERE
+from media.onnx_models import colour_classifier, colour_detector
 
 
 @pytest.mark.parametrize(
@@ -124,7 +126,8 @@ def test_the_names_of_heads_are_those_that_the_library_reads():
 
 
 def test_the_embedded_detector_needs_no_library(monkeypatch):
-    """A flight with the defaults would need the extra."""
+    """A flight with the defaults would need the extra, or its folder of models."""
+    monkeypatch.setenv("HVT_MODELS", "~nobody-here/x")
     whole = open_detector("aerial-nano")
     monkeypatch.setattr("hvt_common.inference.store.installed", lambda _group: {})
     monkeypatch.setattr("hvt_common.inference.detect.plug_in_of", lambda _spec, **_taken: None)
@@ -153,6 +156,19 @@ def test_a_model_of_the_library_that_is_absent(detector, head, says, monkeypatch
     remedy = r"the model library is an extra that is not installed: pip install 'hvt\[edge\]'"
     with pytest.raises(UserError, match=rf"{re.escape(says)}.*{remedy}"):
         open_detector(detector, head=head)
+
+
+def test_a_model_whose_pixels_only_the_library_knows_is_not_fed_wrong_ones(monkeypatch, tmp_path):
+    """A network that scales its pixels itself got them scaled: dark, and sure of one class."""
+    monkeypatch.setattr("hvt_common.inference.store.installed", lambda _group: {})
+    said = colour_classifier(tmp_path / "said.onnx", metadata={"hvt.mean": "0", "hvt.scale": "1"})
+    assert open_classifier(str(said)).class_names
+    for path in (colour_classifier(tmp_path / "c.onnx"), colour_detector(tmp_path / "d.onnx", "yolox")):
+        opened = open_detector if path.name == "d.onnx" else open_classifier
+        with pytest.raises(
+            UserError, match=rf"model {path} is not available: the model library .*pip install"
+        ):
+            opened(str(path))
 
 
 def test_without_geolocation_nothing_is_placed_and_a_model_names_its_extra(monkeypatch):

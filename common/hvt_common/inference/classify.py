@@ -222,7 +222,7 @@ def _preparation(model: OnnxModel, classes: int) -> tuple[Preparation, str]:
         usual, why = _OPEN_MODEL_ZOO, "assumed, as the Open Model Zoo takes them"
     else:
         usual, why = Preparation.torchvision(), "assumed, as torchvision trains"
-    own, dtype = own_steps(model.path), model.inputs[0].dtype
+    own, dtype = own_steps(model), model.inputs[0].dtype
     usual = usual.beside(own)
     why = "it scales them itself" if own.top is not None or dtype == np.uint8 else why
     if any(key.startswith("hvt.") for key in said):

@@ -24,7 +24,7 @@ from hvt_common.inference.labels import (
 )
 from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr, prepared_as, without_palette
 from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
-from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model, own_steps
+from hvt_common.inference.runtimes.model import TRAINED_HERE, ModelSettings, OnnxModel, open_model, own_steps
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
 from hvt_common.runtime.failures import Failures
@@ -40,8 +40,6 @@ _TRIAL_CELLS = (9, 7)
 _USUAL_SIDE = 640
 _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
-_OURS = "hvt.training_commit"
-"""In the metadata of a network that was trained here. Of others the surest box counts, as their authors have it."""
 _ENLARGE_TO = "hvt.enlarge_to"
 _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
@@ -190,7 +188,9 @@ class OnnxDetector:
         self.model = model
         self._confidence = confidence
         self._nms_iou = nms_iou
-        self._averages = _OURS in model.metadata
+        self._averages = (
+            TRAINED_HERE in model.metadata
+        )  # of others the surest box counts, as their authors have it
         task = model.metadata.get("task", "")
         if task and "detect" not in task.lower():
             raise UserError(_not_a_detector(model, f"its task is '{task:.80}', and detect is accepted"))
@@ -207,7 +207,7 @@ class OnnxDetector:
         if any(model.outputs[index].dtype in (np.int8, np.uint8) for index in self.head.outputs):
             why = "its answer is 8-bit numbers without their scale: end its graph with DequantizeLinear"
             raise UserError(_not_a_detector(model, why))
-        usual = self.head.preparation.beside(own_steps(model.path))
+        usual = self.head.preparation.beside(own_steps(model))
         dtype = model.inputs[0].dtype
         assert dtype is not None
         self.preparation = prepared_as(model.path, model.metadata, usual, dtype)

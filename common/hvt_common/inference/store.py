@@ -46,7 +46,8 @@ class ModelStore(Protocol):
     def known_classes(self, path: Path) -> str:
         """The classes of a file that is pinned: ``COCO, 80``, or names; "" for others."""
 
-    def own_steps(self, path: Path) -> OwnSteps:
+    @staticmethod
+    def own_steps(path: Path) -> OwnSteps:
         """The first steps of a checked file on its pixels."""
 
 

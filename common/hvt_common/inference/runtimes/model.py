@@ -35,7 +35,7 @@ from hvt_common.inference.runtimes.providers import (
     ProviderChoice,
     choose_provider,
 )
-from hvt_common.inference.store import library_part, model_store, needed_part
+from hvt_common.inference.store import ModelStore, library_part, needed_part
 
 if TYPE_CHECKING:
     import onnxruntime as ort
@@ -47,6 +47,8 @@ _MOST_AXES = 8
 _MOST_ELEMENTS = 1 << 26
 """Limit of one input or output with its free sizes taken as 1: 256 MiB of float32, a picture of 4096x4096."""
 
+TRAINED_HERE = "hvt.training_commit"
+"""In the metadata of a network that was trained here."""
 _MOST_CHARS = 300
 _ARENA_BYTES = 128 << 20
 LIGHT_BYTES = 8_000_000
@@ -222,10 +224,15 @@ def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxMo
     return OnnxModel(path, inputs, outputs, metadata=metadata, runner=runner, provider=choice)
 
 
-def own_steps(path: Path) -> OwnSteps:
-    """The first steps on its pixels of a checked file, as the model library reads them; most have none."""
-    store = model_store()
-    return OwnSteps() if store is None else store.own_steps(path)
+def own_steps(model: OnnxModel) -> OwnSteps:
+    """The first steps on its pixels of a model, as the model library reads them; most have none.
+
+    Without the library a model says its pixels, or was trained here; else raises `UserError`: pixels that are scaled
+    twice show nothing, and say so to nobody.
+    """
+    known = {TRAINED_HERE} <= model.metadata.keys() or {"hvt.mean", "hvt.scale"} <= model.metadata.keys()
+    library = library_part("store") if known else needed_part("store", f"model {model.path}")
+    return OwnSteps() if library is None else cast("type[ModelStore]", library).own_steps(model.path)
 
 
 def _ports(session: ort.InferenceSession) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
