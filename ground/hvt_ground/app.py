@@ -8,7 +8,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -217,7 +217,7 @@ class Ground:
 
     def _link_anew(self, links: ExitStack, parts: _Parts) -> zenoh.Session | None:
         # None where the run ends meanwhile: a file of the link's may be gone for a while, or its port taken.
-        self._anew, maker = True, replace(self._state_maker(parts, None), disconnected=True)
+        self._anew, maker = True, self._state_maker(parts, None)
         while not self._stop.is_set():
             try:
                 session = links.enter_context(self._open_link(parts.models))

@@ -258,8 +258,6 @@ class StateMaker:
     loading: Callable[[], bool] = lambda: False
     recorded: bool = True
     group: Group | None = None
-    disconnected: bool = False
-    """The ground has no link: sessions that it closed for that have not ended at their edges."""
 
     def __post_init__(self) -> None:
         self._links: dict[str, tuple[LinkState, int]] = {}
@@ -308,7 +306,7 @@ class StateMaker:
 
     def _link(self, edge: str, sessions: EdgeSessions, session: Session | None, now_ns: int) -> LinkState:
         if session is None:
-            return ("lost" if self.disconnected else "ended") if sessions.ended else "waiting"
+            return ("lost" if sessions.disconnected else "ended") if sessions.ended else "waiting"
         if sessions.receiver.silent_ns > LOST_NS and not session.lockstep:
             return "lost"
         left_out = _left_out(session.reception.last_status)

@@ -104,6 +104,8 @@ class EdgeSessions:
         self.session: Session | None = None
         """The one that is open."""
         self.ended = 0
+        self.disconnected = False
+        """The newest was closed here, as without a link, and has not ended at its edge."""
         self._part, self._video = f"session of {port.edge}", f"video of {port.edge}"
         self._turns = Turns(self._video, self.failures)
         self._unseen_failure = 0
@@ -181,6 +183,7 @@ class EdgeSessions:
 
     def close(self) -> None:
         """End the session that is open, and close the recordings of former ones."""
+        self.disconnected = self.session is not None and self._ended_ns is None
         self._end_session()
         # The summaries are there all the same.
         self.failures.attempt(f"recordings of former sessions of {self.port.edge}", self.backlog.close, None)

@@ -272,13 +272,14 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
     nobody = EdgeSessions(Port(), open_session=ground.open_one)
     (waiting,) = maker.make([("uav-2", nobody)]).edges
     assert (waiting.link, waiting.session) == ("waiting", None)
+
+
+@pytest.mark.parametrize(("state", "link"), [("running", "lost"), ("ended", "ended")])
+def test_a_ground_without_a_link_tells_who_has_landed_from_whom_it_left(ground, state, link):
+    """It said that flights ended, or that edges which landed long ago are lost."""
+    ground.report(lambda status: replace(status, sequence=9, state=state))
     ground.end()
-    links = [
-        StateMaker(time.time_ns, disconnected=one).make([("uav-1", ground.sessions)]) for one in (False, True)
-    ]
-    assert [one.edges[0].link for one in links] == ["ended", "lost"], (
-        "a ground without a link said that flights ended"
-    )
+    assert StateMaker(time.time_ns).make([("uav-1", ground.sessions)]).edges[0].link == link
 
 
 def test_an_edge_that_leaves_frames_out_is_on_a_thin_link(ground):
