@@ -147,6 +147,9 @@ class _Checks:
         found = detector.detect(picture)
         self._detect_s = time.process_time() - cpu_s
         took_ms = 1000 * (time.monotonic() - began_s)
+        for one in self._world.failures.now:  # of A+B the others go on
+            if one.part.startswith("detector"):
+                raise UserError(f"{one.part} does not run ({one.reason}): choose another with --detector")
         return Finding(
             "ok", f"{self._config.detector}: {took_ms:.0f} ms a picture, {len(found.class_ids)} found in one"
         )

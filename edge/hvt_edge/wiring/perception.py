@@ -109,7 +109,7 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
     except foreign() as error:
         works, why = False, reason_of(error)
     if not works:
-        raise UserError(f"detector {config.detector} does not run: {why}; choose another with --detector")
+        raise UserError(f"detector {config.detector} does not run ({why}): choose another with --detector")
 
 
 def make_analyzer(

@@ -10,6 +10,8 @@ from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 
 import hvt_edge.cli
@@ -17,6 +19,7 @@ import hvt_ground.cli
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.session.subscribe import GroundLink
+from media.onnx_models import colour_detector, failing_in_the_light
 from media.pictures import write_scene
 from programs.fleet_keys import Fleet
 from programs.processes import free_ports
@@ -95,6 +98,18 @@ def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
     assert found["detector"]["state"] == found["processor"]["state"] == "unknown"
     assert found["link"]["state"] == "warning", "the ground may come later"
     assert "nobody listens" in found["link"]["found"] or "refused" in found["link"]["found"], found["link"]
+
+
+def test_a_network_beside_another_that_does_not_run_is_told(tmp_path, capsys):
+    """It would be found out in flight: the other goes on."""
+    (tmp_path / "white").mkdir()
+    cv2.imwrite(str(tmp_path / "white" / "0.png"), np.full((180, 320, 3), 255, np.uint8))
+    first, second = failing_in_the_light(tmp_path / "a.onnx"), colour_detector(tmp_path / "b.onnx", "yolox")
+    words = (*CHEAP, "--detector", f"{first}+{second}", "--connect", "tcp/127.0.0.1:9")
+    _, found = examined(capsys, EDGE, "--source", str(tmp_path / "white"), *words)
+    assert found["detector"]["state"] == "wrong"
+    assert found["detector"]["found"].startswith("detector 1 does not run (")
+    assert found["detector"]["todo"] == "choose another with --detector"
 
 
 def test_the_cameras_password_is_not_printed(free_port, capsys):

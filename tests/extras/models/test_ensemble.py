@@ -107,7 +107,7 @@ def test_where_one_part_fails_the_others_go_on(caplog: pytest.LogCaptureFixture)
     view: Any = SimpleNamespace(base_size=(64, 64), source_size=(64, 64), enlarges=False)
     warm_up_for(config, both, view)
     for one, why in ((neither, "none of its networks does"), (Fails(STREET), "RuntimeError: device lost")):
-        with pytest.raises(UserError, match=f"detector aerial-nano does not run: {why}; choose another"):
+        with pytest.raises(UserError, match=rf"detector aerial-nano does not run \({why}\): choose another"):
             warm_up_for(config, one, view)
     answers = [found, None]
     back: Any = SimpleNamespace(class_names=AERIAL, detect=lambda _: answers.pop())
