@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
@@ -195,6 +196,7 @@ class _InHand(threading.local):
 
 
 _in_hand = _InHand()
+_firsts = itertools.count(0, 1 << 32)
 
 
 class Turns:
@@ -207,9 +209,9 @@ class Turns:
         self, name: str, failures: Failures, *, clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.name, self._failures, self._clock = name, failures, clock
-        self.count = 0
-        """Begun and ended, or left for an inner one: odd while it is asked."""
-        self._seen = 0, 0
+        self.count = next(_firsts)
+        """Begun and ended, or left for an inner one: odd while it is asked, and no other's of any part."""
+        self._seen = self.count, 0
         """As many at a former `check`, and when."""
         self._hangs = False
         self._outer: Turns | None = None

@@ -145,6 +145,14 @@ def test_of_parts_that_hang_in_one_another_the_inner_one_is_said():
     assert "hangs;" in failures.hanging
 
 
+def test_calls_that_each_return_are_not_taken_for_one_that_hangs():
+    """A run whose disk is slow was ended after 9 s, as one that hangs: its extra was asked at both looks."""
+    failures = Failures(time.time_ns)
+    first, second = (failures.attempt("web page", failures.in_hand, None) for _ in range(2))
+    assert [one for one, _ in (*first, *second)] == ["web page"] * 2
+    assert not first & second
+
+
 @pytest.mark.parametrize(
     "run",
     [
