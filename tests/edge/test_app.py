@@ -6,7 +6,7 @@ import itertools
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -80,18 +80,37 @@ def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path)
     assert summary["frames_captured"] == FRAMES
 
 
-def test_a_link_is_mended_while_a_clip_waits_for_its_ground(tmp_path):
-    """No ground could have come any more: a deaf listener was made anew with the first picture alone."""
-    mended: list[bool] = []
+def test_a_link_is_mended_while_a_clip_waits_for_its_ground_and_sends_its_store(tmp_path):
+    """No ground could have come any more: a deaf listener was made anew with pictures alone."""
+    mended, stop = list[str](), threading.Event()
 
-    class Waiting(Staged):
+    class Alone(Staged):
+        phase = "waits"
+
         def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
             link = super().open_link(stack, config)
-            link.mend = lambda: mended.append(bool(self.reports))
+            link.mend, link.has_ground = self.mend, lambda: self.phase == "plays"
             return link
 
-    edge(tmp_path, Waiting(lambda _frame: mended.append(True)), wait=0.1).run()
-    assert mended[0] is False
+        def open_source(self, config: EdgeConfig) -> Source:
+            source = super().open_source(config)
+            frames = source.frames
+            source.frames = lambda **at: self.play(frames(**at))
+            return source
+
+        def play(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+            self.phase = "plays"
+            yield from frames
+            self.phase = "is over"
+
+        def mend(self) -> None:
+            mended.append(self.phase)
+            if self.phase == "is over":
+                stop.set()
+
+    edge(tmp_path, Alone(), wait=0.1, store=64 << 20, store_folder=tmp_path / "store", stop=stop).run()
+    assert mended[0] == "waits"
+    assert mended.count("is over") == 2, "while it sends, and with the last report"
 
 
 def test_an_edge_that_hangs_is_reported(tmp_path):

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass, replace
+from itertools import chain
 from typing import Self
 
 from hvt_common.protocol.edge_words import FrameGroup
@@ -99,13 +100,16 @@ class RealtimePace:
 
     def steps(self, frames: Iterable[Frame | None]) -> Iterator[Frame | None]:
         """``frames``, with None for each quarter of a second for which a clip's next one is not due."""
-        for frame in frames:
-            while not (self.live or frame is None or self.stop.is_set()):
-                if frame.capture_ns + self.counts.paused_ns - self.clock() <= IDLE_S * SECOND_NS:
-                    break
-                self.stop.wait(IDLE_S)
-                yield None
-            yield frame
+        return iter(frames) if self.live else chain.from_iterable(map(self._when_due, frames))
+
+    def _when_due(self, frame: Frame | None) -> Iterator[Frame | None]:
+        # Ends with its frame: a loop over all would hold each while the next is read.
+        while not (frame is None or self.stop.is_set()):
+            if frame.capture_ns + self.counts.paused_ns - self.clock() <= IDLE_S * SECOND_NS:
+                break
+            self.stop.wait(IDLE_S)
+            yield None
+        yield frame
 
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it.

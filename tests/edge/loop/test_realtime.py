@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import pytest
 
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_common.values import AccessUnit
+from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
@@ -139,11 +142,30 @@ def test_the_loop_turns_while_a_clip_of_few_frames_waits_for_the_next():
     """A requested still, a report and a command's rate waited for it: 10 s at one frame in 10 s."""
     out, turns = Out(), list[int | None]()
     with paced(out, QuietStills(), fps=0.1) as pace:
-        for frame in pace.steps(framed(smooth_pictures(2, size=SIZE), fps=0.1)):
+        for frame in pace.steps(framed(smooth_pictures(3, size=SIZE), fps=0.1)):
             turns.append(frame and frame.index)
             pace.step(frame)
-    assert turns == [0, *[None] * 39, 1]
-    assert [one.send_delay_ns for one in out.headers] == [0, 0]
+            if len(turns) == 45:
+                out.time.set()
+    assert turns == [0, *[None] * 39, 1, *[None] * 4, 2], "it is stopped in its second wait"
+    assert [one.send_delay_ns for one in out.headers[:2]] == [0, 0]
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_no_frame_is_held_while_the_next_is_read(live):
+    """The memory of a small board would have to hold one 1080p frame more."""
+    pictures, held = list[weakref.ref[Any]](), list[int]()
+
+    def read(index: int) -> Frame:
+        held.extend(before for before, picture in enumerate(pictures) if picture() is not None)
+        picture = np.zeros((8, 8, 3), np.uint8)
+        pictures.append(weakref.ref(picture))
+        return Frame(index, START_NS, picture, picture)
+
+    with paced(Out(), QuietStills(), live=live) as pace:
+        for frame in pace.steps(map(read, range(3))):
+            del frame  # as the edge does
+    assert (len(pictures), held) == (3, [])
 
 
 @pytest.mark.parametrize("reading_s", [0.1, 0.4, 3.0])
