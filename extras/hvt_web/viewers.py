@@ -269,6 +269,8 @@ class Hub:
                 viewer.put_video(message, begins=True)
 
     def overlay(self, edge: EdgePage, message: str) -> None:
+        if self.edges.get(edge.edge) is not edge:
+            return
         edge.overlay = message
         for viewer in self._watching(edge):
             viewer.put_video(message, begins=False)
@@ -281,7 +283,9 @@ class Hub:
             viewer.put(message)
 
     def notice(self, edge: EdgePage, message: str) -> None:
-        """An event; the wall shows the last one of each edge."""
+        """An event, but not of a session that is over; the wall shows the last one of each edge."""
+        if self.edges.get(edge.edge) is not edge:
+            return
         edge.notices.append(message)
         self._to_all(message)
 

@@ -237,8 +237,9 @@ def test_edges_that_the_ground_has_left_are_forgotten(hub):
     """Who invents names would fill its memory, and every wall; a newcomer is there before the state knows it."""
     viewer = Viewer()
     hub.join(viewer)
-    for name in ("gone", "here"):
-        hub.begin(EdgePage(name), {"edge": name})
+    gone, here = EdgePage("gone"), EdgePage("here")
+    for page in (gone, here):
+        hub.begin(page, {"edge": page.edge})
     hub.state('{"type": "state"}', {"gone": (0, 1.0, 1.0, 1.0)}, known=frozenset({"gone", "here"}))
     hub.state('{"type": "state"}', {}, known=frozenset({"here"}))
     hub.begin(EdgePage("new"), {"edge": "new"})
@@ -246,3 +247,5 @@ def test_edges_that_the_ground_has_left_are_forgotten(hub):
     hub.state('{"type": "state"}', {}, known=frozenset({"here"}))
     assert hub.edges.keys() == {"here", "new"}
     assert kinds(viewer)[-2:] == ["gone", "state"], "an open page had it for as long as it stayed open"
+    hub.notice(gone, '{"type": "notice"}')
+    assert kinds(viewer) == [], "its last event brought it back"
