@@ -216,8 +216,9 @@ class Ground:
         return open_session(self._config.link, failures=models.failures, on_deaf=self._deaf.set)
 
     def _link_anew(self, links: ExitStack, parts: _Parts) -> zenoh.Session | None:
-        # None where the run ends meanwhile: a file of the link's may be gone for a while, or its port taken.
-        self._anew, maker = True, self._state_maker(parts, None)
+        # A file of the link's may be gone for a while, or its port taken; None where it is stopped meanwhile. Raises
+        # the error of the link where the models cannot be used, or, with --once, none can have come back in time.
+        self._anew, self._began_s, maker = True, time.monotonic(), self._state_maker(parts, None)
         while not self._stop.is_set():
             try:
                 session = links.enter_context(self._open_link(parts.models))
@@ -225,6 +226,8 @@ class Ground:
                 parts.models.failures.failed("link", reason_of(error))
                 notify_systemd("WATCHDOG=1")
                 self._tell(maker, parts, "no link")
+                if parts.models.error is not None or (self._config.once and self._waited):
+                    raise
                 self._stop.wait(_POLL_S * _STATUS_EVERY_POLLS)
             else:
                 parts.models.failures.works("link")
@@ -239,7 +242,7 @@ class Ground:
             group: Group | None = None
             if config.group is not None:
                 shown = next((one.shown_to_others for one in parts.services if one.shown_to_others), "")
-                group = stack.enter_context(link_doctor().share_edges(session, config.group, page=shown))
+                group = stack.enter_context(link_doctor().sharer()(session, config.group, page=shown))
             attempt = parts.models.failures.attempt
             logs = ((part_of(one), one.message_log) for one in parts.services if one.message_log is not None)
             log = next((partial(attempt, part, log, None) for part, log in logs), None)
@@ -376,9 +379,13 @@ class Ground:
         gone = all(one.idle and not one.port.present.is_set() for one in edges)
         if not any(one.ended for one in edges):
             # Nobody came, who came left without a picture, or who left has nothing to come back for.
-            waits_s = max(self._config.wait, _BACK_WITHIN_S * self._anew)
-            return gone and not loading and 0 < waits_s < time.monotonic() - self._began_s
+            return gone and not loading and self._waited
         return gone
+
+    @property
+    def _waited(self) -> bool:
+        waits_s = max(self._config.wait, _BACK_WITHIN_S * self._anew)
+        return 0 < waits_s < time.monotonic() - self._began_s
 
     def _close_edges(self) -> None:
         # Several finish in the time of one.

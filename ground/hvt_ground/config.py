@@ -13,6 +13,7 @@ from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, parts_of
 from hvt_common.protocol.channels import GroupKeys, check_edge_pattern
 from hvt_common.runtime.log import LOG_FORMATS
+from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_common.units import Limit, parse_limit
 
@@ -186,6 +187,8 @@ def check(config: GroundConfig, *, more: Iterable[Written] = ()) -> GroundConfig
         if path.suffix == (suffix or path.suffix)
     )
     check_apart(files)  # files in a folder have names of their own
+    if config.group is not None:
+        link_doctor().sharer()  # refused here, before anything is opened or written
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):

@@ -106,8 +106,8 @@ def test_a_link_without_its_doctor_is_a_link(monkeypatch, free_port):
     with open_session(settings) as session, link_doctor().watch(session, settings, served=bool) as watch:
         assert (watch.trouble, watch.may_command("uav-1")) == ("", True)
         assert link_doctor().refusals(settings)("uav-1") == ""
-        with pytest.raises(UserError, match=r"^--group is of an extra .*: pip install 'hvt\[ground\]'$"):
-            link_doctor().share_edges(session, "north", page="")
+    with pytest.raises(UserError, match=r"^--group is of an extra .*: pip install 'hvt\[ground\]'$"):
+        check(GroundConfig(group="north"))  # once all was open, and folders lay there
 
 
 def test_an_option_whose_part_is_of_an_extra_that_is_absent(monkeypatch, tmp_path):

@@ -40,13 +40,17 @@ class Run:
     def __init__(self, settings: GroundConfig, **more: Any) -> None:
         self.started, self.stop = threading.Event(), threading.Event()
         self.sessions: list[dict[str, Any]] | None = None
-        self._ground = Ground(settings, stop=self.stop, on_started=self.started.set, **more)
+        self.error: Exception | None = None
+        self.ground = Ground(settings, stop=self.stop, on_started=self.started.set, **more)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         assert self.started.wait(60)
 
     def _run(self) -> None:
-        self.sessions = self._ground.run()
+        try:
+            self.sessions = self.ground.run()
+        except (FlightError, UserError) as error:
+            self.error = error
 
     @property
     def over(self) -> bool:
@@ -135,6 +139,36 @@ def test_a_listener_that_hears_nothing_any_more_is_made_anew(
             eventually(lambda: "hvt-receive-uav-1" in [one.name for one in threading.enumerate()])
         clock.now_s = 61.0
         run.wait()
+    finally:
+        run.stop.set()
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_a_link_that_cannot_be_made_anew_keeps_no_run_from_its_end(
+    free_port: int, tmp_path: Path, monkeypatch, caplog, clock, *, once: bool
+) -> None:
+    """``--once`` never returned; nor did a run whose models cannot be used."""
+    first = iter((open_session,))
+
+    def opens(*given: Any, **more: Any) -> Any:
+        for opened in first:
+            return opened(*given, **more)
+        raise UserError("cannot read ca.pem")
+
+    monkeypatch.setattr(app, "open_session", opens)
+    run = Run(config(free_port, tmp_path, once=once))
+    try:
+        clock.now_s = 1e6  # they were there until now
+        run.ground._deaf.set()  # noqa: SLF001 - as its listener says
+        eventually(lambda: "link: cannot read ca.pem" in caplog.text)
+        clock.now_s += 59.0
+        time.sleep(1.5)  # it tries once more
+        assert not run.over
+        clock.now_s += 2.0
+        if not once:
+            monkeypatch.setattr(app.Models, "error", UserError("it is no model"))
+        run.wait()
+        assert str(run.error) == ("the ground cannot go on: cannot read ca.pem" if once else "it is no model")
     finally:
         run.stop.set()
 

@@ -61,10 +61,10 @@ class LinkDoctor:
         """Says of an edge why its ``control`` need not be tried; empty where our own configuration allows it."""
         return lambda _edge: ""
 
-    def share_edges(self, session: zenoh.Session, group: str, *, page: str) -> AbstractContextManager[Any]:  # noqa: ARG002
-        """This ground as a member of a group, which a ``page`` shows to others (`hvt_ground.link.group`).
+    def sharer(self) -> Callable[..., AbstractContextManager[Any]]:
+        """``(session, group, page=…)`` makes this ground a member, which a ``page`` shows to others.
 
-        Raises `UserError` where nothing shares.
+        The context is a `hvt_ground.link.group.Group`. Raises `UserError` where nothing shares.
         """
         raise UserError("--group is of an extra that is not installed: pip install 'hvt[ground]'")
 

@@ -311,10 +311,10 @@ def visit(config: zenoh.Config) -> list[str]:
         return [str(error)]
 
 
-def _share_edges(session: zenoh.Session, group: str, *, page: str) -> AbstractContextManager[Any]:
+def _sharer() -> Callable[..., AbstractContextManager[Any]]:
     from hvt_fleet.link.group import GroundGroup  # noqa: PLC0415 - which imports the ground, and an edge has none
 
-    return GroundGroup(session, group, page=page)
+    return GroundGroup
 
 
 class Doctor(LinkDoctor):
@@ -323,7 +323,7 @@ class Doctor(LinkDoctor):
     check_keys = staticmethod(check_own_keys)
     check_id = staticmethod(refuse_duplicate_edge)
     refusals = staticmethod(refusals)
-    share_edges = staticmethod(_share_edges)
+    sharer = staticmethod(_sharer)
     why_no_link = staticmethod(visit)
     watch = staticmethod(Watch)
 
