@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import subprocess
@@ -278,12 +279,27 @@ def test_what_cannot_be_put_right_in_flight_is_one_sentence(free_port: int, tmp_
     assert raised.value.summary == [], "of no session, for none was there"
 
 
-@pytest.mark.integration
-def test_a_summary_that_cannot_be_written_any_more_is_code_1(free_port: int, tmp_path: Path) -> None:
-    """A disk that filled in flight would look like a wrong setting, so that the ground is not started again."""
+@pytest.fixture
+def command(free_port: int) -> list[str]:
+    """A ground that ends by itself, up to the file of its summary."""
     words = ["--listen", f"tcp/127.0.0.1:{free_port}", "--detector", "motion", "--classifier", "none"]
-    words += ["--once", "--wait", "1s", "--summary", "/dev/full", "--quiet"]
-    command = [sys.executable, "-m", "hvt_ground.cli", *words]
+    return [sys.executable, "-m", "hvt_ground.cli", *words, "--once", "--wait", "1s", "--summary"]
+
+
+@pytest.mark.integration
+def test_a_ground_serves_on_when_nobody_reads_its_status(command: list[str], tmp_path: Path) -> None:
+    """The recording would end with the terminal."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as dead:
+        subprocess.run([*command, "s.json"], cwd=tmp_path, stdout=dead, stderr=dead, check=True)
+    assert json.loads((tmp_path / "s.json").read_text()) == []
+
+
+@pytest.mark.integration
+def test_a_summary_that_cannot_be_written_any_more_is_code_1(command: list[str], tmp_path: Path) -> None:
+    """A disk that filled in flight would look like a wrong setting, so that the ground is not started again."""
+    command += ["/dev/full", "--quiet"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stderr
     assert done.stderr == "hvt-ground: /dev/full cannot be written (No space left on device)\n"

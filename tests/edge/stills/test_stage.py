@@ -376,6 +376,17 @@ def test_the_worker_takes_all_frames_in_order_and_finishes():
     assert [one.frame_index for one, _ in rig.out.stills] == [0, 15]
 
 
+def test_a_pending_still_leaves_without_another_frame():
+    """At one frame a second each still would wait for the next, and there find the link busy with it."""
+    rig = Rig()
+    rig.keyframes.require(FRAMES[0].capture_ns)
+    rig.run(1)
+    assert (len(rig.stage.outbox), rig.out.stills) == (1, []), "a keyframe goes first"
+    rig.keyframes.done(FRAMES[0].capture_ns)
+    with closing(worker_of(rig)):
+        eventually(lambda: rig.out.stills, what="the still has left")
+
+
 def test_stills_that_fail_stop_alone_and_go_on_from_a_keyframe(caplog):
     """A single bad picture would end the flight's video; or the edge look alive and never send a still again."""
     broken = threading.Event()

@@ -622,6 +622,8 @@ def test_info_says_which_adapter_fits_and_why(
     assert bool(report.class_names) == (adapter != "none")
     assert (report.median_ms is not None) == (adapter != "none")
     assert report.opsets.keys() == {""}
+    assert main(["info", str(tmp_path / "m.onnx"), "--provider", "tensorrt"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
     assert main(["info", str(tmp_path / "m.onnx")]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert f"adapter {adapter}" in shown

@@ -95,6 +95,15 @@ def test_a_broken_plug_in_is_named(installed, names, answer, says):
         open_detector("acme")
 
 
+def test_a_name_that_is_built_in_is_refused(installed):
+    """What --detector aerial-nano is would depend on what else is installed."""
+    installed({"aerial-nano": "BlobDetector"}, module="acme_blobs", source=BLOBS)
+    with pytest.raises(
+        UserError, match=r"'aerial-nano' is built in, and package acme_blobs .* brings another"
+    ):
+        open_detector("aerial-nano")
+
+
 @pytest.mark.usefixtures("blobs")
 def test_it_is_listed_and_scored(tmp_path, capsys):
     """Nobody could say how good the runtime's network is on his pictures, nor see that HVT has found it."""
