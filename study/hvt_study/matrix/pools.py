@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 import traceback
@@ -12,6 +13,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.reduction import ForkingPickler
 from multiprocessing.resource_tracker import ensure_running
 from typing import ParamSpec, TypeVar, cast
 
@@ -31,7 +33,7 @@ _GOES_ON = "finished runs are kept, and the same command goes on from there"
 def local_pool(jobs: int) -> Iterator[Executor]:
     """So many processes. On an error they end at once: finished runs are in the cache.
 
-    Raises `UserError` where a process was killed.
+    Raises `UserError` where a process was killed, or cannot be started.
     """
     pool = _Processes(jobs)
     try:
@@ -93,7 +95,7 @@ class _Processes(ThreadPoolExecutor):
         self._here = threading.local()
         self._each: list[tuple[BaseProcess, Connection]] = []
         self._ended = False
-        super().__init__(jobs, initializer=self._start)
+        super().__init__(jobs)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         return super().submit(self._there, partial(fn, *args, **kwargs))
@@ -114,14 +116,22 @@ class _Processes(ThreadPoolExecutor):
         ensure_running()  # it unblocks Ctrl-C
         # Blocked signals are inherited: one that is still being imported would answer Ctrl-C with a traceback.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self._here.pipe, there = self._context.Pipe()
+        here, there = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(there,), daemon=True)
         process.start()
         there.close()
-        self._each.append((process, self._here.pipe))
+        self._here.pipe = here
+        self._each.append((process, here))
 
     def _there(self, work: Callable[[], R]) -> R:
-        if self._ended:
+        if not hasattr(self._here, "pipe") and not self._ended:
+            try:
+                self._start()
+            except OSError as error:
+                raise UserError(
+                    f"a process of the study cannot be started ({error.strerror}; lower --jobs): {_GOES_ON}"
+                ) from None
+        if self._ended:  # and if only since: `end` has seen what was started before
             raise BrokenExecutor
         try:
             self._here.pipe.send(work)
@@ -136,13 +146,22 @@ class _Processes(ThreadPoolExecutor):
 def _serve(pipe: Connection) -> None:
     _prepare()
     with suppress(EOFError):
-        while work := pipe.recv():
-            try:
-                answer = True, work()
-            except Exception as error:  # noqa: BLE001 - it is raised in the process that asked
-                error.add_note(traceback.format_exc())
-                answer = False, error
-            pipe.send(answer)
+        while True:
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
+
+
+def _answer(asked: bytes) -> bytes:
+    try:
+        return bytes(ForkingPickler.dumps((True, pickle.loads(asked)())))  # noqa: S301 - of our own parent
+    except BaseException as error:  # noqa: BLE001 - it is raised in the process that asked
+        told = traceback.format_exc()
+        error.add_note(told)
+        with suppress(Exception):  # some cannot be sent, or not be made again from what was sent
+            failed = bytes(ForkingPickler.dumps((False, error)))
+            pickle.loads(failed)  # noqa: S301 - our own
+            if isinstance(error, Exception):  # `SystemExit` would end the study without a word
+                return failed
+        return bytes(ForkingPickler.dumps((False, RuntimeError(told))))
 
 
 def _prepare() -> None:
