@@ -62,7 +62,7 @@ class Clip:
 
     def _read(self) -> Iterator[Image]:
         if self.spec.startswith(SCHEME):
-            camera = open_camera(self.spec, fps=NOMINAL_FPS, seed=self.seed, annotated=False)
+            camera = open_camera(self.spec, fps=NOMINAL_FPS, seed=self.seed)
             return islice(camera.images(), self.frame_count)
         source = open_source(
             self.spec,

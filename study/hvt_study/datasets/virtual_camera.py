@@ -29,8 +29,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
 from hvt_study.datasets.label_files import (
+    Folders,
     class_file,
-    in_any_case,
     keypoint_columns,
     read_image,
     read_yolo,
@@ -94,14 +94,14 @@ class _Way:
         )
 
 
-def annotation_file(picture: Path) -> Path:
-    """Where the annotations of a picture are, or would be."""
-    beside = in_any_case(picture.with_suffix(".txt"))
-    if picture.parent.name.lower() != "images" or beside.is_file():
-        return beside
-    root, name = picture.parent.parent, beside.name
-    yolo = in_any_case(root / _YOLO / name)
-    return yolo if yolo.is_file() else in_any_case(root / "annotations" / name)
+def annotation_file(picture: Path, folders: Folders) -> Path:
+    """Where the annotations of a picture are, or would be; ``folders`` are listed once for all pictures of a set."""
+    beside = picture.with_suffix(".txt")
+    places = [beside]
+    if picture.parent.name.lower() == "images":
+        places += [picture.parent.parent / name / beside.name for name in (_YOLO, "annotations")]
+    found = (folders.find(place) for place in places)
+    return next((file for file in found if file is not None and file.is_file()), places[-1])
 
 
 def read_annotations(
@@ -135,8 +135,8 @@ class VirtualCamera:
     """Height of its view at its lowest, in heights of the picture; beyond about 0.9 mirrored land is in view."""
     fps: float = 15.0
     seed: int = 0
-    annotated: bool = True
-    """False: the annotations are not looked at."""
+    annotation_path: Path | None = None
+    """None: annotations are not looked at."""
     classes: tuple[str, ...] = ()
     """Classes of YOLO's labels; none: those of ``classes.txt``."""
     annotations: FrameLabels | None = field(init=False)
@@ -162,9 +162,9 @@ class VirtualCamera:
         # One aspect ratio for all pictures, that of the usual base stream.
         across = min(wide, high * 16 / 9) * self.view_heights
         self.size = (int(across) // 2 * 2, int(across * 9 / 16) // 2 * 2)
-        file = annotation_file(self.picture_path)
+        file = self.annotation_path
         self.annotations = None
-        if self.annotated and file.is_file():
+        if file is not None and file.is_file():
             found, self.class_set = read_annotations(file, (wide, high), classes=self.classes)
             self.annotations = _mirrored(found, size=(wide, high))
         self._way = _Way.of(self.seed)
@@ -242,12 +242,12 @@ class VirtualCamera:
         return clipped.astype(np.float32), inside / np.maximum(area, 1e-9)
 
 
-def open_camera(spec: str, *, fps: float, seed: int = 0, annotated: bool = True) -> VirtualCamera:
-    """The camera of ``still:PICTURE`` or ``still:PICTURE@HEIGHT``, on the way of a seed."""
+def open_camera(spec: str, *, fps: float, seed: int = 0) -> VirtualCamera:
+    """The camera of ``still:PICTURE`` or ``still:PICTURE@HEIGHT``, on the way of a seed, without annotations."""
     text = spec.removeprefix(SCHEME)
     name, separator, height = text.rpartition("@")
     if not separator or Path(text).is_file():
-        return VirtualCamera(Path(text), fps=fps, seed=seed, annotated=annotated)
+        return VirtualCamera(Path(text), fps=fps, seed=seed)
     try:
         heights = float(height)
     except ValueError:
@@ -257,7 +257,7 @@ def open_camera(spec: str, *, fps: float, seed: int = 0, annotated: bool = True)
             f"{spec!r} asks for a view of {height!r} heights of the picture: "
             f"give a number from {_LEAST_VIEW:g} to {_MOST_VIEW:g}"
         )
-    return VirtualCamera(Path(name), heights, fps, seed, annotated)
+    return VirtualCamera(Path(name), heights, fps, seed)
 
 
 def _mirrored(found: FrameLabels, *, size: tuple[int, int]) -> FrameLabels:

@@ -260,7 +260,7 @@ def _opened(plan: ComparePlan) -> tuple[str, Sequence]:
     if clip == "demo":
         uri = "demo:0"
     elif clip.startswith(SCHEME):
-        camera = open_camera(clip, fps=1, annotated=False)  # names faults of picture and height
+        camera = open_camera(clip, fps=1)  # names faults of picture and height
         uri = f"{SCHEME}{camera.picture_path}"
         options["view"] = f"{camera.view_heights:g}"
     elif (Path(clip) / "gt" / "gt.txt").is_file():

@@ -3,6 +3,7 @@
 import pickle
 import shutil
 from itertools import islice, pairwise
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -107,6 +108,18 @@ def test_a_seed_is_a_way(root):
     assert staged.pixels
     plain = VirtualCamera(root / "images" / "street.png")
     assert not np.array_equal(next(plain.images()), next(again.images()))
+
+
+def test_each_folder_of_a_set_is_listed_once(root, monkeypatch):
+    """A set of thousands would take a listing of them all for each of its pictures, and each of their frames."""
+    listed, iterdir = [], Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda folder: (listed.append(folder), iterdir(folder))[1])
+    for number in range(12):
+        for folder, name in (("images", "png"), ("annotations", "txt")):
+            shutil.copy(root / folder / f"street.{name}", root / folder / f"{number}.{name}")
+    sequences = open_dataset(f"still:{root}")
+    assert [one.labels(0) for one in sequences]
+    assert listed.count(root / "images") < len(sequences) == 13
 
 
 def test_a_folder_of_pictures_with_annotations_beside(root):

@@ -9,7 +9,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.sequence import content_hash
-from hvt_study.datasets.virtual_camera import VirtualCamera, open_camera, read_annotations
+from hvt_study.datasets.virtual_camera import USUAL_VIEW, VirtualCamera, open_camera, read_annotations
 
 BOX = (300, 200, 40, 24)  # x, y, w, h of a white block
 
@@ -28,10 +28,10 @@ def picture(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("height", ["", "@0.5", "@2"])
+@pytest.mark.parametrize("height", [USUAL_VIEW, 0.5, 2])
 def test_boxes_follow_exactly(picture, height):
     """F1 at IoU 0.5 of small objects is lost by a pixel or two, in the mirrored land as in the picture."""
-    camera = open_camera(f"still:{picture}{height}", fps=3)
+    camera = VirtualCamera(picture, height, fps=3, annotation_path=picture.with_suffix(".txt"))
     seen = 0
     for index, image in enumerate(camera.images()):
         labels = camera.labels(index)
@@ -46,7 +46,7 @@ def test_boxes_follow_exactly(picture, height):
             found = xs[near].min(), ys[near].min(), xs[near].max() + 1, ys[near].max() + 1
             assert np.allclose(found, (x1, y1, x2, y2), atol=1.01)
             seen += 1
-    assert seen >= (1 if height == "@0.5" else 6)
+    assert seen >= (1 if height == 0.5 else 6)
 
 
 def test_it_moves_and_every_frame_has_noise_of_its_own(picture):
@@ -63,7 +63,7 @@ def test_regions_without_labels_are_known(picture):
     assert found.class_names == ("car",)
     assert found.ignored_xyxy_px.tolist() == [[10, 10, 60, 60]]
     assert found.beside_xyxy_px.tolist() == [[500, 300, 520, 320]]  # a single object: boxes on it alone
-    camera = VirtualCamera(picture)
+    camera = VirtualCamera(picture, annotation_path=picture.with_suffix(".txt"))
     seen = [camera.labels(index) for index in range(0, 200, 20)]
     assert sum(len(one.ignored_xyxy_px) for one in seen) > 0
     assert sum(len(one.beside_xyxy_px) for one in seen) > 0
@@ -86,12 +86,12 @@ def test_a_bad_picture_or_height_is_one_sentence(picture, name, said):
 def test_a_bad_annotation_is_named_with_its_line(picture, caplog):
     """One bad line would end a whole set; a table of another layout would give nonsense."""
     picture.with_suffix(".txt").write_text("1,2,3,4,1,4,0,0\n1;2;3\n")
-    VirtualCamera(picture)
+    VirtualCamera(picture, annotation_path=picture.with_suffix(".txt"))
     assert "1 of 2 lines are left out; the first:" in caplog.text
     assert "line 2 is '1;2;3'" in caplog.text
     picture.with_suffix(".txt").write_text("1;2;3\n")
     with pytest.raises(UserError, match="line 1"):
-        VirtualCamera(picture)
+        VirtualCamera(picture, annotation_path=picture.with_suffix(".txt"))
 
 
 def test_yolo_labels_lie_where_visdrones_do(picture):
@@ -108,7 +108,7 @@ def test_yolo_labels_lie_where_visdrones_do(picture):
         open_dataset(f"still:{root}")
     (sequence,) = open_dataset(f"still:{moved}?classes=dontcare,truck,person&view=0.9")
     found = sequence.labels(105)
-    image = next(islice(open_camera(f"still:{moved}@0.9", fps=15, annotated=False).images(), 105, None))
+    image = next(islice(open_camera(f"still:{moved}@0.9", fps=15).images(), 105, None))
     assert (sequence.class_set, set(found.class_names)) == (("person", "truck"), {"truck"})
     ys, xs = np.nonzero(image[:, :, 0] > 145)
     assert any(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_edge.source.folder import sequence_files
-from hvt_study.datasets.label_files import in_any_case
+from hvt_study.datasets.label_files import Folders, in_any_case
 from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.image_sequence import find_folders
@@ -20,9 +20,11 @@ from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
 
 
-def still_labels(picture: Path, view: float, seed: int, classes: tuple[str, ...], index: int) -> FrameLabels:
+def still_labels(
+    picture: Path, file: Path, view: float, seed: int, classes: tuple[str, ...], index: int
+) -> FrameLabels:
     """The virtual camera's labels in frame ``index``, in its pixels; each mirror image is an object of its own."""
-    labels = _camera(picture, view, seed, True, classes, _stamps(picture)).labels(index)
+    labels = _camera(picture, file, view, seed, classes, _stamps(picture, file)).labels(index)
     assert labels is not None, "made for annotated pictures only"
     return labels
 
@@ -33,10 +35,11 @@ def open_stills(place: Path, options: Options) -> Mapping[str, Callable[[], Sequ
     Raises `UserError` where there are no pictures, or annotations are missing.
     """
     pictures = [place] if place.is_file() else _pictures(place)
+    folders = Folders()
     if options.annotated and place.is_dir():
-        _check_annotated(place, pictures)
+        _check_annotated(place, pictures, folders)
     return {
-        name: partial(_open, name, picture, seed, options)
+        name: partial(_open, name, picture, seed, options, folders)
         for label, picture in _labelled(pictures).items()
         for seed in options.seeds
         for name in [label if options.seeds == (0,) else f"{label}-{seed}"]
@@ -64,18 +67,20 @@ def _labelled(pictures: list[Path]) -> dict[str, Path]:
     return found
 
 
-def _check_annotated(place: Path, pictures: list[Path]) -> None:
-    missing = next((picture for picture in pictures if not annotation_file(picture).is_file()), None)
+def _check_annotated(place: Path, pictures: list[Path], folders: Folders) -> None:
+    missing = next((one for one in pictures if not annotation_file(one, folders).is_file()), None)
     if missing is not None:
         raise UserError(
-            f"still folder {place} has no annotations {annotation_file(missing)} of picture {missing.name}: "
+            f"still folder {place} has no annotations {annotation_file(missing, folders)} of picture {missing.name}: "
             "add them, or ask for pictures alone with ?labels=none"
         )
 
 
-def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
+def _open(name: str, picture: Path, seed: int, options: Options, folders: Folders) -> Sequence:
     view = float(f"{options.view or USUAL_VIEW:g}")  # as it is written in the clip's name
-    camera = _camera(picture, view, seed, options.annotated, options.classes, _stamps(picture))
+    file = annotation_file(picture, folders)
+    labelled = file if options.annotated else None
+    camera = _camera(picture, labelled, view, seed, options.classes, _stamps(picture, file))
     known = camera.annotations
     named = () if known is None else known.class_names  # in the order of the file, which has but numbers
     return Sequence(
@@ -85,25 +90,25 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
         frame_count=camera.frame_count,
         fps=NOMINAL_FPS,
         source_size=camera.size,
-        labels=None if known is None else partial(still_labels, picture, view, seed, options.classes),
+        labels=None if known is None else partial(still_labels, picture, file, view, seed, options.classes),
         class_set=camera.class_set,
         attributes={"view": f"{view:g}", "seed": f"{seed}", "classes": ",".join(dict.fromkeys(named))},
-        files=(picture,) if known is None else (picture, annotation_file(picture)),
+        files=(picture,) if known is None else (picture, file),
     )
 
 
 @lru_cache(maxsize=2)
 def _camera(
     picture: Path,
+    file: Path | None,
     view: float,
     seed: int,
-    annotated: bool,  # noqa: FBT001 - part of the key
     classes: tuple[str, ...],
-    stamps: tuple[Hashable, ...],  # noqa: ARG001 - likewise
+    stamps: tuple[Hashable, ...],  # noqa: ARG001 - part of the key
 ) -> VirtualCamera:
-    return VirtualCamera(picture, view, NOMINAL_FPS, seed, annotated, classes)
+    return VirtualCamera(picture, view, NOMINAL_FPS, seed, file, classes)
 
 
-def _stamps(picture: Path) -> tuple[Hashable, ...]:
+def _stamps(picture: Path, file: Path) -> tuple[Hashable, ...]:
     """Other ones when picture or annotations have changed."""
-    return file_stamp(picture), file_stamp(annotation_file(picture))
+    return file_stamp(picture), file_stamp(file)
