@@ -23,6 +23,8 @@ DETECTING = ("hvt_common", "hvt_models")
 """Packages that decide a detector's results."""
 FLYING = (*DETECTING, "hvt_codecs", "hvt_edge", "hvt_ground", "hvt_scene", "hvt_study")
 """Has one in a flight and its figures."""
+KINDS = (".py", ".toml", ".csv", ".txt", ".onnx", ".j2", ".css")
+"""Ends of the names of all files that these packages consist of."""
 _BESIDE = ("hvt_study/commands", "hvt_study/report")
 """Has no say in a flight or in its figures."""
 _DIGITS = 16
@@ -45,23 +47,32 @@ def code_digest(*packages: str, without: tuple[str, ...] = ()) -> str:
 def tree_digest(folders: Iterable[Path], *, without: Collection[str] = ()) -> str:
     """Hexadecimal; of the names and contents of all files below, in whatever order a disk lists them.
 
-    Tables of class names decide figures as code does; bytecode and hidden files are left out. ``without`` names
-    folders as `code_digest` does: from the last part of one of ``folders`` on.
+    Tables of class names decide figures as code does; hidden files and other kinds than `KINDS`, such as bytecode and
+    an editor's copies, are left out. ``without`` names folders as `code_digest` does: from the last part of one of
+    ``folders`` on.
     """
     digest = hashlib.sha256()
     files = {
-        file.relative_to(folder.parent).as_posix(): file
-        for folder in folders
-        for file in folder.rglob("[!.]*")
-        if file.is_file() and file.parent.name != "__pycache__"
+        file.relative_to(folder.parent).as_posix(): file for folder in folders for file in _counting(folder)
     }
     for name, file in sorted(files.items()):
         if any(name.startswith(f"{folder}/") for folder in without):
             continue
-        content = file.read_bytes()
+        try:
+            content = file.read_bytes()
+        except FileNotFoundError:  # since it was listed
+            continue
         digest.update(f"{name} {len(content)}\n".encode())
         digest.update(content)
     return digest.hexdigest()[:_DIGITS]
+
+
+def _counting(folder: Path) -> Iterator[Path]:
+    for place, folders, names in os.walk(folder):
+        folders[:] = (name for name in folders if not name.startswith("."))
+        for name in names:
+            if name.endswith(KINDS) and not name.startswith("."):
+                yield Path(place, name)
 
 
 def installed(packages: Iterable[str]) -> dict[str, str]:

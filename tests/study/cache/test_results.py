@@ -13,6 +13,7 @@ from hvt_common.errors import UserError
 from hvt_study.cache.results import (
     DETECTING,
     FLYING,
+    KINDS,
     ResultCache,
     code_digest,
     content_key,
@@ -112,6 +113,9 @@ def test_an_edit_is_another_code(tmp_path):
     assert own not in [tree_digest([edit]) for edit in edits]
     (before / "__pycache__").mkdir()
     shutil.copy(before / "tracker.py", before / "__pycache__" / "tracker.pyc")
+    (before / ".cache" / "mine").mkdir(parents=True)
+    for name in (".cache/mine/tracker.py", ".#tracker.py", "#tracker.py#", "tracker.py~", "tracker.py.orig"):
+        shutil.copy(before / "tracker.py", before / name)
     assert tree_digest([page], without=["mine/report"]) == tree_digest([before], without=["mine/report"])
 
 
@@ -122,6 +126,22 @@ def test_what_runs_here_is_in_every_row():
     assert len(flight_code()) == 16
     assert code_digest("hvt_common") != flight_code()
     assert {"machine", "pillow", "msgpack"} <= versions.keys()
+
+
+def test_each_kind_of_file_that_is_shipped_counts():
+    """A table of another kind would be edited, and the figures of the old one would stand."""
+    listed = subprocess.run(
+        ["git", "ls-files", *(f"*/{name}/*" for name in FLYING)],
+        cwd=Path(__file__).parents[3],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if listed.returncode:
+        pytest.skip("no git here")
+    files = listed.stdout.split()
+    assert files
+    assert not [name for name in files if not name.endswith(KINDS)]
 
 
 def test_all_that_a_flight_loads_is_its_code():
