@@ -129,11 +129,11 @@ def _small_objects(rows: dict[tuple[str, float], CompareRow]) -> Iterator[Goal]:
             best["f1"] >= factor * row["f1"],
         )
         goal = f"delay p95 of M6 at 200 kbps no worse than {other}'s"
-        yield (
-            goal,
-            f"{best['delay_p95_ms']:.0f} and {row['delay_p95_ms']:.0f} ms",
-            best["delay_p95_ms"] <= row["delay_p95_ms"],
-        )
+        delays = best["delay_p95_ms"], row["delay_p95_ms"]
+        if None in delays:
+            yield goal, "no frame arrived", None
+        else:
+            yield goal, "{:.0f} and {:.0f} ms".format(*delays), delays[0] <= delays[1]
 
 
 def _never_worse(rows: dict[tuple[str, float], CompareRow]) -> Goal:
