@@ -5,11 +5,15 @@ A device that never ends is one that is too large to read.
 
 import codecs
 import errno
+import fcntl
+import logging
 import os
 import select
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 MOST_BYTES = 16_000_000
@@ -17,6 +21,7 @@ MOST_TABLE_BYTES = 1_000_000_000
 """Limit for labels and annotations of a whole dataset."""
 PIPE_WAIT_S = 10.0
 """The longest wait for a pipe's other end, and then for its content."""
+_log = logging.getLogger(__name__)
 
 
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
@@ -93,6 +98,37 @@ def write_whole(path: Path, content: bytes) -> None:
         with suppress(OSError):
             scratch.unlink()
         raise
+
+
+@contextmanager
+def locked(path: Path, on_wait: Callable[[], object] = lambda: None) -> Iterator[None]:
+    """Hold the lock of this file, which is made and stays: whoever else asks for it, a thread too, waits.
+
+    ``on_wait`` is called before this one waits. The lock ends with the process. A file system without locks is
+    warned of once, and nobody waits. Raises `OSError` where the file cannot be made.
+    """
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except PermissionError:
+        if not path.exists():
+            raise
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # another user made it
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            on_wait()
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError as error:
+            _warn_of(path.parent, error.strerror)
+        yield
+    finally:
+        os.close(file)
+
+
+@cache
+def _warn_of(folder: Path, why: str) -> None:
+    _log.warning("%s takes no locks (%s): let one program at a time write there", folder, why)
 
 
 def _is_output(path: Path) -> bool:

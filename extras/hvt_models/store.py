@@ -11,13 +11,13 @@ import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError, named_path, telling
-from hvt_common.files import read_text
+from hvt_common.files import locked, read_text
 from hvt_common.inference.store import MOTION, embedded_models
 from hvt_models.exports.first_steps import own_steps
 from hvt_models.manifest import (
@@ -253,20 +253,13 @@ class Store:
 
     @contextmanager
     def _lock(self, name: str, on_wait: Callable[[], None] = lambda: None) -> Iterator[None]:
-        import filelock  # noqa: PLC0415 - as above
-
-        with telling(f"models folder {self.folder} cannot be written (", "): set HVT_MODELS to one that can"):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            lock = filelock.FileLock(self.folder / f".{name}.lock")
-            try:
-                lock.acquire(timeout=0)
-            except filelock.Timeout:
-                on_wait()
-                lock.acquire()
-        try:
+        with ExitStack() as lock:
+            with telling(
+                f"models folder {self.folder} cannot be written (", "): set HVT_MODELS to one that can"
+            ):
+                self.folder.mkdir(parents=True, exist_ok=True)
+                lock.enter_context(locked(self.folder / f".{name}.lock", on_wait))
             yield
-        finally:
-            lock.release()
 
     def _how_to_get(self, entry: ModelEntry) -> str:
         if not entry.urls:

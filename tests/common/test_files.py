@@ -1,10 +1,13 @@
-"""Files that are written: whether a name still leads to one."""
+"""Files that are written: whether a name still leads to one, and whether another program is at work on it."""
 
+import errno
+import fcntl
+import os
 import subprocess
 
 import pytest
 
-from hvt_common.files import check_there
+from hvt_common.files import check_there, locked
 
 
 def test_one_on_a_disk_that_was_unmounted_is_noticed(tmp_path):
@@ -31,3 +34,30 @@ def test_one_that_was_moved_is_there(tmp_path):
         (tmp_path / "kept" / path.name).unlink()
         with pytest.raises(FileNotFoundError, match="it was removed"):
             check_there(file.fileno(), path)
+
+
+def test_who_cannot_have_a_lock_is_told(tmp_path, monkeypatch, caplog):
+    """A study would wait without a word, or end after its flights where a disk has no locks."""
+    path = tmp_path / ".lock"
+    with locked(path), pytest.raises(ZeroDivisionError), locked(path, lambda: 1 / 0):
+        pass
+    opened = os.open
+
+    def of_another(path, flags, *mode):
+        if flags & os.O_RDWR:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, flags, *mode)
+
+    def refused(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(os, "open", of_another)
+    with locked(path), pytest.raises(ZeroDivisionError), locked(path, lambda: 1 / 0):
+        pass
+    with pytest.raises(PermissionError), locked(tmp_path / "other"):
+        pass
+    monkeypatch.setattr(fcntl, "flock", refused)
+    for _ in range(2):
+        with locked(path):
+            pass
+    assert caplog.text.count("takes no locks (No locks available)") == 1

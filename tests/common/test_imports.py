@@ -5,7 +5,7 @@ import pytest
 from programs.processes import python
 
 HEAVY = {
-    *("av", "onnxruntime", "zenoh", "rich", "rerun", "filelock", "json5", "openvino"),
+    *("av", "onnxruntime", "zenoh", "rich", "rerun", "json5", "openvino"),
     *("hvt_edge.app", "hvt_ground.app"),
 }
 

@@ -4,7 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -14,7 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from hvt_common.errors import FlightError, UserError, telling
-from hvt_common.runtime.reporting import check_writable
+from hvt_common.files import locked
+from hvt_common.runtime.reporting import check_writable, say
 
 _WIDTH = 100
 _LINE_EVERY_S = 60
@@ -89,6 +90,17 @@ def writing(folder: Path) -> Iterator[None]:
         cause = error if isinstance(error, OSError) else error.__cause__
         why = cause.strerror if isinstance(cause, OSError) else error
         raise UserError(f"--out {folder} cannot be written ({why}): name another") from None
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Of studies that write into one folder one reads and writes at a time; in one that is not there nobody does."""
+    with ExitStack() as lock:
+        if folder.is_dir():
+            with telling(f"{folder} cannot be written (", "): name another folder"):
+                wait = f"another study writes into {folder}: waiting for it"
+                lock.enter_context(locked(folder / ".lock", lambda: say(wait)))
+        yield
 
 
 class RunProgress:

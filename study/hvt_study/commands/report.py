@@ -6,6 +6,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
 from hvt_study.commands.arguments import option
+from hvt_study.commands.output import alone
 from hvt_study.report.write import join_studies, write_report
 
 
@@ -27,13 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     out: Path | None = getattr(arguments, "out", None)
-    if out is not None:
-        join_studies(arguments.folders, out)
-    elif len(arguments.folders) > 1:
+    if out is None and len(arguments.folders) > 1:
         raise UserError(
             f"{len(arguments.folders)} studies are given, and no place for the one: add --out DIR"
         )
     where = arguments.folders[0] if out is None else out
-    write_report(where, accounting=getattr(arguments, "accounting", None))
+    with alone(where):
+        if out is not None:
+            join_studies(arguments.folders, out)
+        write_report(where, accounting=getattr(arguments, "accounting", None))
     say(str(where / "report.html"))
     return 0

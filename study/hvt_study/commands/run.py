@@ -2,20 +2,18 @@
 
 import argparse
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
-
-from filelock import FileLock
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
 from hvt_study.commands import arguments as common
-from hvt_study.commands.output import RunProgress, check_out, writing
+from hvt_study.commands.output import RunProgress, alone, check_out, writing
 from hvt_study.matrix.plan import RunRow, StudyPlan, check_parameters, first_runs, in_order, run_all, staying
 from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.table_file import RESULTS, read_results, write_results
-from hvt_study.report.example.choice import choose_run, load_example, save_example
+from hvt_study.report.example.choice import Example, choose_run, load_example, save_example
 from hvt_study.report.example.fly_again import fly_again
 from hvt_study.report.write import write_report
 from hvt_study.runs.execute import runner
@@ -40,11 +38,14 @@ def run(arguments: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     plan = common.study_plan(arguments, common.open_sequences(arguments))
     table = check_out(arguments.out, name=RESULTS)
-    check_parameters(plan, _earlier(table), out=arguments.out)
+    with writing(arguments.out), alone(arguments.out):
+        check_parameters(plan, _earlier(table), out=arguments.out)
     rows = _flown(plan, arguments, table)
-    others = _write(rows, arguments, table)
-    _add_example(rows, plan, arguments.out)
-    with _alone(arguments.out):
+    others = _write(rows, plan, arguments, table)
+    example = new_example(rows, plan, arguments.out)
+    with alone(arguments.out):
+        if example is not None:
+            save_example(arguments.out, example)
         write_report(arguments.out)
     failed = [row for row in rows if row["failed"]]
     if len(failed) == len(rows):
@@ -70,19 +71,23 @@ def _earlier(table: Path) -> list[RunRow]:
         return []
 
 
-def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> int:
-    """Write them, and behind them the remaining rows of the present table; returns the number of those."""
-    with _alone(arguments.out):
-        others = staying(rows, _earlier(table))
+def _write(rows: list[RunRow], plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> int:
+    """Write them, and behind them the remaining rows of the present table; returns the number of those.
+
+    They go beside a table that another study with other parameters has written since: `UserError`.
+    """
+    with writing(arguments.out), alone(arguments.out):
+        earlier = _earlier(table)
+        try:
+            check_parameters(plan, earlier, out=arguments.out)
+        except UserError as error:
+            names = (table.with_name(f"{table.stem}-{number}{table.suffix}") for number in count(2))
+            beside = next(path for path in names if not path.exists())
+            write_results(in_accounting(rows, arguments.accounting), beside)
+            raise UserError(f"{error}; the runs of this study are in {beside}") from None
+        others = staying(rows, earlier)
         write_results(in_accounting([*rows, *others], arguments.accounting), table)
     return len(others)
-
-
-@contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    """Of two studies that write into one folder each adds to the other's rows."""
-    with writing(out), FileLock(out / ".lock"):
-        yield
 
 
 def _flown(plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> list[RunRow]:
@@ -101,8 +106,11 @@ def _flown(plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> list[
             return run_all(plan, pool=workers, run=runner(plan.cache), at_once=at_once, on_row=on_row)
     except BaseException:
         if done:
-            with suppress(UserError):  # the error that ended the study is reported
-                others = _write(in_order(plan, done), arguments, table)
+            try:
+                others = _write(in_order(plan, done), plan, arguments, table)
+            except UserError as error:  # the one that ended the study is reported too
+                progress.note(str(error))
+            else:
                 beside = f", and {others} of before" if others else ""
                 progress.note(
                     f"{len(done)} finished runs are in {table}{beside}; the same command goes on from there"
@@ -118,15 +126,16 @@ def _failure(row: RunRow) -> str:
     return f"{method}{matching} on {row['sequence']}, {row['regime']}, failed: {row['failed']}"
 
 
-def _add_example(rows: list[RunRow], plan: StudyPlan, folder: Path) -> None:
-    """The report shows one flight in pictures; it is flown again for them."""
+def new_example(rows: list[RunRow], plan: StudyPlan, folder: Path) -> Example | None:
+    """The report shows one flight in pictures; it is flown again for them, unless the folder has it."""
     choice = choose_run(rows)
     if choice is None:
-        return
+        return None
     digest = next(row["digest"] for row in rows if row["key"] == choice.key)
     known = None
     with suppress(UserError):  # one that was cut off is made again
         known = load_example(folder)
-    if known is None or (known.key, known.digest, known.rule) != (choice.key, digest, choice.rule):
-        spec = next(one for one in first_runs(plan) if one.key == choice.key)
-        save_example(folder, fly_again(spec, plan, rule=choice.rule))
+    if known is not None and (known.key, known.digest, known.rule) == (choice.key, digest, choice.rule):
+        return None
+    spec = next(one for one in first_runs(plan) if one.key == choice.key)
+    return fly_again(spec, plan, rule=choice.rule)

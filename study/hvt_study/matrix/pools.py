@@ -131,7 +131,7 @@ class _Processes(ThreadPoolExecutor):
                 raise UserError(
                     f"a process of the study cannot be started ({error.strerror}; lower --jobs): {_GOES_ON}"
                 ) from None
-        if self._ended:  # and if only since: `end` has seen what was started before
+        if self._ended:  # perhaps only now: `end` has terminated all that was started before
             raise BrokenExecutor
         try:
             self._here.pipe.send(work)
@@ -150,18 +150,18 @@ def _serve(pipe: Connection) -> None:
             pipe.send_bytes(_answer(pipe.recv_bytes()))
 
 
-def _answer(asked: bytes) -> bytes:
+def _answer(request: bytes) -> bytes:
     try:
-        return bytes(ForkingPickler.dumps((True, pickle.loads(asked)())))  # noqa: S301 - of our own parent
+        return bytes(ForkingPickler.dumps((True, pickle.loads(request)())))  # noqa: S301 - of our own parent
     except BaseException as error:  # noqa: BLE001 - it is raised in the process that asked
-        told = traceback.format_exc()
-        error.add_note(told)
-        with suppress(Exception):  # some cannot be sent, or not be made again from what was sent
+        trace = traceback.format_exc()
+        error.add_note(trace)
+        with suppress(Exception):  # an error may not survive pickling
             failed = bytes(ForkingPickler.dumps((False, error)))
             pickle.loads(failed)  # noqa: S301 - our own
             if isinstance(error, Exception):  # `SystemExit` would end the study without a word
                 return failed
-        return bytes(ForkingPickler.dumps((False, RuntimeError(told))))
+        return bytes(ForkingPickler.dumps((False, RuntimeError(trace))))
 
 
 def _prepare() -> None:

@@ -15,10 +15,10 @@ from typing import Any
 
 import av
 import cv2
-from filelock import FileLock
 
 from hvt_common import __version__
 from hvt_common.errors import UserError
+from hvt_common.files import locked
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.labels import default_confidence, first_synonym
@@ -232,7 +232,7 @@ def _with_reference(
         return reference_labels(sequence, detector=detector, classifier=found.classifier, size=size).pack()
 
     try:
-        with FileLock(cache / "labels" / f"{name}.lock"):
+        with locked(cache / "labels" / f"{name}.lock"):
             known = store.known(name, label)
     except OSError as error:
         raise CacheError(

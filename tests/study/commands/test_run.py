@@ -6,12 +6,12 @@ import signal
 
 import numpy as np
 import pytest
-from filelock import FileLock, Timeout
 
+from hvt_common.files import locked
 from hvt_study.cli import main
 from hvt_study.commands import run as command
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
-from hvt_study.report.data.table_file import write_results
+from hvt_study.report.data.table_file import read_results, write_results
 from hvt_study.runs import execute
 from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_context import open_materials, open_run_context
@@ -129,24 +129,40 @@ def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkey
     assert len(table(out)) == len(before)
 
 
-def test_a_study_beside_another_in_one_folder_keeps_its_rows(scene, done, tmp_path, monkeypatch):
-    """Who starts the second half in another window would find the rows of one of them alone."""
+def test_a_study_beside_another_in_one_folder_keeps_its_rows(scene, done, tmp_path, monkeypatch, capsys):
+    """Who starts the second half in another window would find the rows of one of them alone, or no report."""
     own, other = table(done)[:1], table(done)[1:2]
 
     def flown(*_, **__):
         write_results(other, tmp_path / "results.parquet")  # ended in the meantime
         return own
 
-    def written(rows, path):
-        with pytest.raises(Timeout):  # from reading to writing nobody else does
-            FileLock(tmp_path / ".lock").acquire(blocking=False)
-        write_results(rows, path)
+    def alone(write):
+        def written(*given, **more):
+            with pytest.raises(ZeroDivisionError), locked(tmp_path / ".lock", lambda: 1 / 0):
+                pass  # from reading to writing nobody else is here
+            write(*given, **more)
+
+        return written
 
     monkeypatch.setattr(command, "run_all", flown)
-    monkeypatch.setattr(command, "write_results", written)
+    monkeypatch.setattr(command, "new_example", lambda *_: "example")
+    monkeypatch.setattr(command, "save_example", alone(lambda *_: None))
+    for name in ("write_results", "write_report"):
+        monkeypatch.setattr(command, name, alone(getattr(command, name)))
+    monkeypatch.setattr("hvt_study.commands.report.write_report", alone(lambda *_, **__: None))
     words = arguments(scene, tmp_path, "--methods", "M0", "--regimes", REGIME, "--jobs", "1")
     assert main(["run", *words]) == 0
     assert {row["key"] for row in table(tmp_path)} == {row["key"] for row in (*own, *other)}
+    assert main(["report", str(tmp_path)]) == 0
+    (tmp_path / "results.parquet").unlink()
+    tuned = json.loads(own[0]["config"])
+    tuned["run"]["tune"] = ["value=2"]  # no report takes both
+    other[0] = {**own[0], "config": json.dumps(tuned)}
+    assert main(["run", *words]) == 2
+    assert "the runs of this study are in" in capsys.readouterr().err
+    tables = table(tmp_path), read_results(tmp_path / "results-2.parquet")
+    assert [row["config"] for (row,) in tables] == [row["config"] for row in (*other, *own)]
 
 
 @pytest.mark.nightly
@@ -249,6 +265,7 @@ def test_wrong_input_is_one_sentence(scene, tmp_path, capsys):
     names = {"names": "{0: 'cat', 1: 'dog', 2: 'cow'}"}
     other = colour_detector(tmp_path / "other.onnx", "yolox", metadata=names)
     (tmp_path / "file").write_text("")
+    (tmp_path / "locked" / ".lock").mkdir(parents=True)
     for words, wanted, *place in (
         ((f"visdrone:{tmp_path}/bare",), "has no annotations"),
         ((f"visdrone:{tmp_path}/bare?labels=none",), "add --labels reference"),
@@ -261,6 +278,7 @@ def test_wrong_input_is_one_sentence(scene, tmp_path, capsys):
         ((scene, "--max-frames", "3"), "--max-frames 3 is too few"),
         ((scene, "--detect-every", "0"), "--detect-every 0"),
         ((scene, *METHODS), "--out", "file"),
+        ((scene, *METHODS), "locked cannot be written", "locked"),
     ):
         assert main(["run", *arguments(words[0], tmp_path / (place or ["out"])[0], *words[1:])]) == 2
         sentence = capsys.readouterr().err

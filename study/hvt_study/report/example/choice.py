@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from hvt_common.errors import FlightError, UserError
+from hvt_common.files import write_whole
 from hvt_common.runtime.reporting import write_json
 from hvt_common.values import Image
 from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, is_video, settings, values
@@ -183,7 +184,7 @@ def save_example(folder: Path, example: Example) -> None:
         place.mkdir(parents=True, exist_ok=True)
         for crop in content["crops"]:
             for name in _PICTURES:
-                (place / f"{crop['percentile']}-{name}.png").write_bytes(crop.pop(f"{name}_png"))
+                write_whole(place / f"{crop['percentile']}-{name}.png", crop.pop(f"{name}_png"))
         write_json(place / _FILE, content)
     except (OSError, FlightError) as error:
         why = error.strerror if isinstance(error, OSError) else error
