@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, Self, cast
-
-import zenoh
+from typing import TYPE_CHECKING, Any, Self, cast
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import EdgeKeys
 from hvt_common.runtime.plug_ins import loaded, the_one
-from hvt_common.transport.zenoh_config import LinkSettings
+
+if TYPE_CHECKING:  # the configuration asks here, and a wrong setting is told without a link
+    import zenoh
+
+    from hvt_common.transport.zenoh_config import LinkSettings
 
 _GROUP = "hvt.link"
 

@@ -239,7 +239,7 @@ def test_a_bus_of_stored_video_is_called_as_it_is_live(flight):
     """Seen aslant it was a vehicle before the outage and after it, and a bus in the middle."""
 
     class Buses(RedSquares):
-        class_names = ("bus",)
+        class_names, confidence = ("bus",), 0.95
 
     tilt = ViewTilt(vague_kinds=True)
     found = looked_at(flight, lambda late: setattr(tilt, "aslant", late), detector_of=Buses, tilt=tilt)

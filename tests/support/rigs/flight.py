@@ -80,6 +80,7 @@ class RedSquares:
     """A detector of red things; it may be slow."""
 
     class_names = CLASSES
+    confidence = 0.9
 
     def __init__(self, *, takes_s: float = 0.0) -> None:
         self.takes_s = takes_s
@@ -91,7 +92,7 @@ class RedSquares:
         if len(xs) < 100:
             return Detections.none()
         box = np.array([[xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]], np.float32)
-        return Detections(box, np.array([0.9], np.float32), np.zeros(1, np.int32))
+        return Detections(box, np.array([self.confidence], np.float32), np.zeros(1, np.int32))
 
 
 class NothingSeen:
