@@ -104,12 +104,13 @@ def _flown(plan: StudyPlan, arguments: argparse.Namespace, table: Path) -> list[
     try:
         with progress, pool as workers:
             return run_all(plan, pool=workers, run=runner(plan.cache), at_once=at_once, on_row=on_row)
-    except BaseException:
+    except BaseException as ended:
         if done:
             try:
                 others = _write(in_order(plan, done), plan, arguments, table)
-            except UserError as error:  # the one that ended the study is reported too
-                progress.note(str(error))
+            except UserError as error:
+                if not isinstance(ended, UserError):  # a full disk is told once
+                    progress.note(str(error))
             else:
                 beside = f", and {others} of before" if others else ""
                 progress.note(
