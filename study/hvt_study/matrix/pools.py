@@ -3,19 +3,12 @@
 import logging
 import multiprocessing
 import os
-import pickle
 import signal
 import threading
-import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from functools import partial
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
-from multiprocessing.reduction import ForkingPickler
-from multiprocessing.resource_tracker import ensure_running
-from typing import ParamSpec, TypeVar, cast
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
 
 import cv2
 
@@ -33,13 +26,15 @@ _GOES_ON = "finished runs are kept, and the same command goes on from there"
 def local_pool(jobs: int) -> Iterator[Executor]:
     """So many processes. On an error they end at once: finished runs are in the cache.
 
-    Raises `UserError` where a process was killed, or cannot be started.
+    Raises `UserError` where a process was killed.
     """
-    pool = _Processes(jobs)
+    # Fresh processes: a fork would share threads and locks of open files and models.
+    context = multiprocessing.get_context("spawn")
+    pool = _Processes(jobs, mp_context=context, initializer=_prepare)
     try:
         yield pool
     except BaseException as error:
-        pool.end()
+        _end(pool)
         if isinstance(error, BrokenExecutor):
             raise UserError(
                 f"a process of the study was killed, perhaps for want of memory (lower --jobs): {_GOES_ON}"
@@ -47,7 +42,6 @@ def local_pool(jobs: int) -> Iterator[Executor]:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-        pool.close()
 
 
 @contextmanager
@@ -83,85 +77,16 @@ def dask_pool(address: str) -> Iterator[Executor]:
             pool.shutdown(wait=False)
 
 
-class _Processes(ThreadPoolExecutor):
-    """A process for each thread, which hands it work through a pipe and waits.
-
-    `ProcessPoolExecutor` has semaphores with names in the system, which stay there where all is killed at once.
-    """
-
-    def __init__(self, jobs: int) -> None:
-        # Fresh processes: a fork would share threads and locks of open files and models.
-        self._context = multiprocessing.get_context("spawn")
-        self._here = threading.local()
-        self._each: list[tuple[BaseProcess, Connection]] = []
-        self._ended = False
-        super().__init__(jobs)
+class _Processes(ProcessPoolExecutor):
+    """Starts its processes deaf to Ctrl-C: one that is still being imported would answer it with a traceback."""
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        return super().submit(self._there, partial(fn, *args, **kwargs))
-
-    def end(self) -> None:
-        """Let go of running work."""
-        self._ended = True
-        for process, _ in list(self._each):
-            process.terminate()
-
-    def close(self) -> None:
-        """Let idle processes end in peace."""
-        for process, pipe in self._each:
-            pipe.close()
-            process.join()
-
-    def _start(self) -> None:
-        ensure_running()  # it unblocks Ctrl-C
-        # Blocked signals are inherited: one that is still being imported would answer Ctrl-C with a traceback.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        here, there = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(there,), daemon=True)
-        process.start()
-        there.close()
-        self._here.pipe = here
-        self._each.append((process, here))
-
-    def _there(self, work: Callable[[], R]) -> R:
-        if not hasattr(self._here, "pipe") and not self._ended:
-            try:
-                self._start()
-            except OSError as error:
-                raise UserError(
-                    f"a process of the study cannot be started ({error.strerror}; lower --jobs): {_GOES_ON}"
-                ) from None
-        if self._ended:  # perhaps only now: `end` has terminated all that was started before
-            raise BrokenExecutor
+        # Blocked signals are inherited; here they are only late.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self._here.pipe.send(work)
-            done, found = self._here.pipe.recv()
-        except (EOFError, OSError):
-            raise BrokenExecutor from None
-        if done:
-            return cast("R", found)
-        raise found
-
-
-def _serve(pipe: Connection) -> None:
-    _prepare()
-    with suppress(EOFError):
-        while True:
-            pipe.send_bytes(_answer(pipe.recv_bytes()))
-
-
-def _answer(request: bytes) -> bytes:
-    try:
-        return bytes(ForkingPickler.dumps((True, pickle.loads(request)())))  # noqa: S301 - of our own parent
-    except BaseException as error:  # noqa: BLE001 - it is raised in the process that asked
-        trace = traceback.format_exc()
-        error.add_note(trace)
-        with suppress(Exception):  # an error may not survive pickling
-            failed = bytes(ForkingPickler.dumps((False, error)))
-            pickle.loads(failed)  # noqa: S301 - our own
-            if isinstance(error, Exception):  # `SystemExit` would end the study without a word
-                return failed
-        return bytes(ForkingPickler.dumps((False, RuntimeError(trace))))
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _prepare() -> None:
@@ -177,6 +102,12 @@ def _end_with_parent() -> None:
     assert parent is not None, "it was started by one"
     parent.join()
     os._exit(1)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Let go of running work; Python 3.14 has `terminate_workers` for it."""
+    for process in list((pool._processes or {}).values()):  # noqa: SLF001
+        process.terminate()
 
 
 def _first_line(error: BaseException) -> str:
