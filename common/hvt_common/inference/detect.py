@@ -188,9 +188,8 @@ class OnnxDetector:
         self.model = model
         self._confidence = confidence
         self._nms_iou = nms_iou
-        self._averages = (
-            TRAINED_HERE in model.metadata
-        )  # of others the surest box counts, as their authors have it
+        # Of others the surest box counts, as their authors have it.
+        self._averages = TRAINED_HERE in model.metadata
         task = model.metadata.get("task", "")
         if task and "detect" not in task.lower():
             raise UserError(_not_a_detector(model, f"its task is '{task:.80}', and detect is accepted"))
