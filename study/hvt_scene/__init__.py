@@ -2,6 +2,6 @@
 
 from hvt_scene.appearance import Appearance
 from hvt_scene.scene import Scene
-from hvt_scene.truth import CodeInView, Truth, write_truth
+from hvt_scene.truth import CodeInView, Truth
 
-__all__ = ["Appearance", "CodeInView", "Scene", "Truth", "write_truth"]
+__all__ = ["Appearance", "CodeInView", "Scene", "Truth"]

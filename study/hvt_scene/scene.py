@@ -1,5 +1,6 @@
 """A drawn aerial scene as a continuous function of time: pictures and their exact ground truth."""
 
+import math
 from collections.abc import Collection
 from functools import cached_property
 from pathlib import Path
@@ -8,8 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.files import at_once
 from hvt_common.geodesy import moved
-from hvt_common.units import SECOND_NS
+from hvt_common.units import SECOND_NS, exact_rate
 from hvt_common.values import Image, Orientation, Pose, View
 from hvt_scene.appearance import Appearance
 from hvt_scene.drawing.canvas import OUTLINE_POINTS
@@ -17,7 +19,7 @@ from hvt_scene.drawing.codes import RoofCode, draw_code, paint_code
 from hvt_scene.drawing.foliage import Grove
 from hvt_scene.drawing.ground import Ground, paint_ground
 from hvt_scene.drawing.vehicles import CLASS_NAMES, draw_vehicle
-from hvt_scene.truth import CodeInView, Truth, write_truth
+from hvt_scene.truth import CodeInView, Truth
 from hvt_scene.view import (
     Bgra,
     Camera,
@@ -216,8 +218,22 @@ class Scene:
         _, chosen, places, _ = self._view(t_s)
         return dict(zip((chosen + 1).tolist(), map(tuple, places[:, :2].tolist()), strict=True))
 
-    def write_truth(self, path: Path, *, fps: float, view: View) -> int:
-        return write_truth(self, path, fps=fps, view=view)
+    def write_truth(self, path: Path, *, fps: float, view: View) -> None:
+        """Write the truth as MOTChallenge's gt.txt, in base pixels.
+
+        A line is ``frame,id,x,y,w,h,1,class,visibility``: frames, pixels and classes count from 1 (class 1 is the
+        first name), boxes are clipped to the base frame; objects wholly outside it are left out.
+        """
+        rate = exact_rate(fps)
+        with open(path, "w", encoding="ascii", opener=at_once) as file:
+            for index in range(math.ceil(self.duration_s * rate)):
+                truth = self.truth(float(index / rate))
+                boxes = np.clip(view.to_base(truth.boxes_source_px), 0, view.base_size * 2)
+                rows = zip(truth.ids, boxes, truth.class_ids, truth.visible, strict=True)
+                for number, (x1, y1, x2, y2), kind, share in rows:
+                    if x2 > x1 and y2 > y1:
+                        box = f"{x1 + 1:.2f},{y1 + 1:.2f},{x2 - x1:.2f},{y2 - y1:.2f}"
+                        file.write(f"{index + 1},{number},{box},1,{kind + 1},{share:.3f}\n")
 
     def _view(
         self, t_s: float, *, without: Collection[int] = ()

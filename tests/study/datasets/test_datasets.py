@@ -292,6 +292,9 @@ def test_mot_labels(tmp_path):
     labels = sequence.labels(1)
     assert labels.boxes_xyxy_px.tolist() == [xyxy(*square_xywh(1))]
     assert labels.ids.tolist() == [4]
+    rows = read_truth_rows(tmp_path / "train" / "MOT17-02" / "gt" / "gt.txt", ["x"] * 13)
+    (scored, *_) = rows.boxes[rows.frames == 2].tolist()
+    assert scored == xyxy(*square_xywh(1)), "hvt-study score had its truth a pixel beside"
     assert labels.ignored_xyxy_px.shape == (0, 4)
     assert labels.beside_xyxy_px.tolist() == [[30, 10, 39, 19]]  # a distractor, not the car or the occluder
     assert [sequence.source_frame(frame_index) for frame_index in range(sequence.clip_frames)] == [0, 1, 3, 5]

@@ -39,7 +39,7 @@ def test_known_answer():
 
 def test_who_lists_a_hidden_object_is_neither_right_nor_wrong(tmp_path):
     """A ground that sees more than was judged would be scored worse for it."""
-    lines = ["1,1,0,0,10,10,1,1,1.0", "1,2,50,0,20,20,1,1,0.2"]
+    lines = ["1,1,1,1,10,10,1,1,1.0", "1,2,51,1,20,20,1,1,0.2"]
     (tmp_path / "gt.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     truth = read_truth(tmp_path / "gt.txt", class_names=("car",))
     seen = (0.0, 0.0, 10.0, 10.0, "car")
@@ -99,7 +99,7 @@ def test_the_table_of_the_ground_reads_back(tmp_path):
 def test_perfect_tracks_of_the_demo_score_one(tmp_path, capsys):
     """The whole way, from the scene's truth file to the printed table."""
     truth_path, tracks_path = tmp_path / "gt.txt", tmp_path / "perfect.csv"
-    lines = ["1,1,10,10,50,30,1,1,1.000", "1,2,100,10,50,30,1,2,1.000", "2,1,12,10,50,30,1,1,0.900"]
+    lines = ["1,1,11,11,50,30,1,1,1.000", "1,2,101,11,50,30,1,2,1.000", "2,1,13,11,50,30,1,1,0.900"]
     truth_path.write_text("\n".join([*lines, "2,2,9,9,9,9,1,3,0.1"]) + "\n")
     names = Scene.class_names
     table = TrackTable(tracks_path)

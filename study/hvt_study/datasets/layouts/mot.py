@@ -126,7 +126,7 @@ def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
     if not classless:
         share = rows["visibility"]
         judged &= (share >= _LEAST_VISIBLE) | (share < 0)  # -1 where the file does not say
-    return TruthRows(rows["frame"].astype(np.int64), rows.boxes(), words, judged, classless)
+    return TruthRows(rows["frame"].astype(np.int64), rows.boxes(origin=1.0), words, judged, classless)
 
 
 def _class_text(highest: int) -> str:
