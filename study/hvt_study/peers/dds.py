@@ -133,10 +133,6 @@ class DdsGround:
     def _request(self, frames: tuple[int, ...]) -> None:
         """Request regions of a whole segment at once, as DDS does."""
         segment = [self._held[frame_index] for frame_index in frames]
-        if self.settings.steady:
-            every = np.logical_or.reduce([one.blocks for one in segment])
-            for one in segment:
-                one.blocks = every
         for one in segment:
             one.whole = not one.blocks.any()
         if not all(one.whole for one in segment):
@@ -234,10 +230,9 @@ def fly_dds(
     `hvt_study.flights.flight.fly`. Raises `UserError` where the budget is too small for two passes of this size and
     frame rate.
     """
-    settings = settings.resolved(budget_bps, size=size)
     rates = pass_rates(budget_bps, size=size, settings=settings)
     line = Line(link_bps=link_bps, budget=RollingBudget(rates.budget), window_ns=settings.window_ns)
-    coded = coded_frames(clip.frame_count, settings.rate)
+    coded = coded_frames(clip.frame_count, settings.fps)
     segments = _segments(coded, settings.segment_frames)
     most_bytes = int(budget_bps * clip.frame_count / NOMINAL_FPS / 8)
     resizer = Resizer(clip.source_size, size, fit="letterbox")

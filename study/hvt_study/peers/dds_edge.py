@@ -40,7 +40,7 @@ def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings)
     request_bps = settings.request_bps
     first_line = settings.share * (budget_bps - request_bps)
     second_line = budget_bps - request_bps - first_line
-    fps = settings.rate
+    fps = settings.fps
     questions = NOMINAL_FPS / settings.segment_frames
     bundles = min(fps, max(questions, second_line / 8 / settings.bundle_bytes))
     small = settings.first_size(size)
@@ -75,7 +75,7 @@ def _beside_bps(
 def most_stored(settings: DdsSettings) -> int:
     """How many frames either end keeps at most while it waits for the other."""
     return max(
-        _STORED_LEAST, round(_STORED_SEGMENTS * settings.segment_frames * settings.rate / NOMINAL_FPS) + 1
+        _STORED_LEAST, round(_STORED_SEGMENTS * settings.segment_frames * settings.fps / NOMINAL_FPS) + 1
     )
 
 
@@ -101,7 +101,7 @@ class DdsEdge:
         self._budget: RollingBudget = line.budget
         self._segments = {frames[0]: frames for frames in segments}
         self._first_size = settings.first_size(size)
-        fps, preset, depth_s = settings.rate, settings.preset, vbv_s(settings.rate)
+        fps, preset, depth_s = settings.fps, settings.preset, vbv_s(settings.fps)
         self._first, self._second = (
             BaseEncoder(EncoderSettings(coded, fps=fps, bitrate_bps=rate_bps, preset=preset, vbv_s=depth_s))
             for coded, rate_bps in ((self._first_size, rates.first_bps), (size, rates.second_bps))

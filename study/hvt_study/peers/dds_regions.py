@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -23,11 +23,6 @@ from hvt_common.inference.nms import suppress
 from hvt_common.values import Boxes, Detections, Image, iou
 from hvt_study.datasets.sequence import NOMINAL_FPS
 
-RATES = (NOMINAL_FPS, 7.5, 5.0, 3.0, 2.0)
-"""Those that the study's video-only methods choose from too."""
-_LEAST_BITS_PER_PX = 0.1
-"""Least bits of the whole budget for each frame: with less, both passes are too coarse (docs/design-notes/dds.md)."""
-
 
 @dataclass(frozen=True, slots=True)
 class DdsSettings:
@@ -37,8 +32,8 @@ class DdsSettings:
     """Share of the budget without requests that the first pass takes; the second has the rest."""
     segment_s: float = 1.0
     """So much media time is asked about at once."""
-    fps: float | None = None
-    """Frames a second of both passes; None: the most of `RATES` that leaves each frame a tenth of a bit a pixel."""
+    fps: float = NOMINAL_FPS
+    """Frames a second of both passes."""
     scale: float = 1.0
     """Width and height of the first pass as shares of the base size. The second has all of it."""
     low: float = 0.1
@@ -54,8 +49,6 @@ class DdsSettings:
     """By so much of its own length a region grows on every side (``rpn_enlarge_ratio``)."""
     align_px: int = 16
     """Regions are made of whole blocks of this side."""
-    steady: bool = False
-    """A region that is asked for in one frame of a segment is asked for in all of them."""
     confidence: float = 0.25
     """From which a final result starts a track."""
     nms_iou: float = 0.45
@@ -68,19 +61,6 @@ class DdsSettings:
     request_bytes: int = 700
     """Line bytes that are kept free for each request. A larger one waits until there is room."""
 
-    def resolved(self, budget_bps: int, *, size: tuple[int, int]) -> DdsSettings:
-        """The same with a frame rate, chosen by the budget where none was given."""
-        if self.fps is not None:
-            return self
-        most = budget_bps / (_LEAST_BITS_PER_PX * size[0] * size[1])
-        return replace(self, fps=next((fps for fps in RATES if fps <= most), RATES[-1]))
-
-    @property
-    def rate(self) -> float:
-        """``fps`` of settings that are `resolved`."""
-        assert self.fps is not None, "settled() comes first"
-        return self.fps
-
     @property
     def segment_frames(self) -> int:
         return max(1, round(self.segment_s * NOMINAL_FPS))
@@ -88,7 +68,7 @@ class DdsSettings:
     @property
     def window_ns(self) -> int:
         """Window of the budget: a second, or long enough for two frames."""
-        return round(1e9 * max(1.0, 2 / self.rate))
+        return round(1e9 * max(1.0, 2 / self.fps))
 
     @property
     def request_bps(self) -> float:

@@ -117,7 +117,7 @@ def settings(
 
 
 def _dds_settings(spec: RunSpec, fps: float | None) -> DdsSettings:
-    return DdsSettings(fps=fps, confidence=default_confidence(spec.models.detector))
+    return DdsSettings(fps=fps or NOMINAL_FPS, confidence=default_confidence(spec.models.detector))
 
 
 def _ground_config(spec: RunSpec) -> GroundConfig:

@@ -16,9 +16,7 @@ from studies.metric_frames import clip_of, list_f1
 
 FRAMES = 46
 BUDGET_BPS = 200_000
-QUICK = DdsSettings(
-    fps=15, high=0.5, preset="ultrafast", request_bytes=200, bundle_bytes=1000, camera_motion="off"
-)
+QUICK = DdsSettings(high=0.5, preset="ultrafast", request_bytes=200, bundle_bytes=1000, camera_motion="off")
 DIM_AT = (200, 20, 232, 52)
 """Where a second square stands, too dim for the first pass."""
 

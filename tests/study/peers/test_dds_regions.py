@@ -125,13 +125,3 @@ def test_a_spoilt_question_is_refused(spoil):
     data = regions.RegionRequest(3, (np.eye(12, 20, dtype=bool),) * 3).pack()
     with pytest.raises(ValueError, match="request"):
         regions.RegionRequest.parse(spoil(data), grid=(12, 20))
-
-
-@pytest.mark.parametrize(
-    ("budget_bps", "fps"), [(2_000_000, 15), (800_000, 7.5), (300_000, 3), (100_000, 2), (1_382_400, 15)]
-)
-def test_the_frame_rate_follows_the_budget(budget_bps, fps):
-    """At fifteen frames a second a thin budget leaves neither pass enough bits to see anything."""
-    # 1280x720 at 0.1 bit a pixel is 92160 bits a frame.
-    assert regions.DdsSettings().resolved(budget_bps, size=(1280, 720)).rate == fps
-    assert regions.DdsSettings(fps=5).resolved(budget_bps, size=(1280, 720)).rate == 5
