@@ -64,7 +64,7 @@ def _fly(name: str) -> CompareResult:
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(name, total=None)
 
-        def on_flights(done: int, of: int, _left_s: float | None) -> None:
+        def on_run(done: int, of: int) -> None:
             progress.update(task, completed=done, total=of)
 
         plan = ComparePlan(
@@ -76,9 +76,8 @@ def _fly(name: str) -> CompareResult:
             rates_bps=_RATES,
             cache=(_OUT / "cache").absolute(),
         )
-        jobs = os.cpu_count() or 1
-        with local_pool(jobs) as pool:
-            result = compare(plan, pool=pool, workers=jobs, on_flights=on_flights)
+        with local_pool(os.cpu_count() or 1) as pool:
+            result = compare(plan, pool=pool, on_run=on_run)
     print(f"{name}: {time.monotonic() - began_s:.0f} s", file=sys.stderr)
     write_json(_OUT / f"{name}.json", list(result.rows))
     plot(result, _OUT / f"{name}.png")

@@ -94,7 +94,6 @@ def _folders(packages: Iterable[str]) -> Iterator[Path]:
 _log = logging.getLogger(__name__)
 
 _CHECKSUM_BYTES = 16
-FLIGHTS = "flights"
 
 
 class CacheError(UserError):
@@ -190,9 +189,6 @@ class ResultCache:
             found = make()
             self.put(key, found)
         return found
-
-    def count(self) -> int:
-        return sum(1 for _ in self._folder.glob("*/*.json"))
 
     def _path(self, key: str) -> Path:
         return self._folder / key[:2] / f"{key}.json"

@@ -68,9 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
     plan = _plan(arguments)
     folder: Path = arguments.out
     file = output.check_out(folder, name="compare.json")
-    opened, jobs = common.open_pool(arguments)
-    with output.RunProgress("flights") as progress, opened as pool:
-        result = compare(plan, pool=pool, workers=jobs, on_flights=progress.update)
+    opened, _ = common.open_pool(arguments)
+    with output.RunProgress("runs") as progress, opened as pool:
+        result = compare(plan, pool=pool, on_run=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
     from hvt_study.report.figures.drawing import plot  # noqa: PLC0415 - Matplotlib, before it says a word

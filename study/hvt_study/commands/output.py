@@ -132,14 +132,13 @@ class RunProgress:
         self._first_line = threading.Timer(first_line_s, self._say_first)
         self._first_line.daemon = True
 
-    def update(self, done: int, of: int, left_s: float | None = None, *, failed: int = 0) -> None:
-        """So many are done, of so many; ``left_s`` where the time left is known better than by how fast they were."""
+    def update(self, done: int, of: int, *, failed: int = 0) -> None:
         now_s = time.monotonic()
         if not self._steps[0][1] and done:
             self._steps.clear()
         if not self._steps or done != self._steps[-1][1]:
             self._steps.append((now_s, done))
-        more = self._more(time_left_s(self._steps, of) if left_s is None else left_s, failed)
+        more = self._more(time_left_s(self._steps, of), failed)
         self._bar.update(self._task, completed=done, total=of, more=more)
         news = (bool(more) and not self._estimated) or done == of
         with self._lock:

@@ -5,10 +5,8 @@ are exact where the source knows its objects (the demo, an annotated picture und
 *reference* labels (`hvt_study.datasets.reference`).
 """
 
-import time
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, wait
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,14 +14,11 @@ from typing import Any, Literal, TypeAlias
 
 from hvt_common.errors import UserError
 from hvt_edge.wiring import default_size
-from hvt_study.cache.results import FLIGHTS, ResultCache
 from hvt_study.datasets.layouts.uri import open_dataset
-from hvt_study.datasets.sequence import NOMINAL_FPS, Sequence
+from hvt_study.datasets.sequence import Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, open_camera
-from hvt_study.matrix.time_left import TimeLeft
-from hvt_study.runs.methods import METHODS, Method
+from hvt_study.runs.methods import METHODS
 from hvt_study.runs.spec import ModelChoice, RunSpec
-from hvt_study.runs.video_shape import competing_sizes
 
 COMPARED: Mapping[str, tuple[str, str]] = {
     "M0": ("M0", ""),
@@ -38,11 +33,6 @@ COMPARED: Mapping[str, tuple[str, str]] = {
 }
 """(method, still codec) by the name in tables, in their order."""
 Labels = Literal["auto", "exact", "reference"]
-_TRIED_SIZES, _AT_A_SIZE = 2, 2
-"""So many other sizes are usually tried where there are as many, in so many flights each."""
-_RATE_POWER = 0.2
-_FPS_POWER = 0.4
-_REPORT_EVERY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,14 +116,11 @@ def compare(
     plan: ComparePlan,
     *,
     pool: Executor,
-    workers: int,
-    on_flights: Callable[[int, int, float | None], None] = lambda *_: None,
+    on_run: Callable[[int, int], None] = lambda *_: None,
 ) -> CompareResult:
-    """Fly everything; ``on_flights(done, of, left_s)`` is called at once and then each second.
+    """Fly everything; ``on_run(done, of)`` is called at once and after each method at each rate.
 
-    ``of`` is how many flights may be needed, ``left_s`` the time that they take, None while that is not known;
-    ``workers`` is how many the pool flies at a time. Raises `UserError` where the clip, a detector or a rate cannot
-    be used.
+    Raises `UserError` where the clip, a detector or a rate cannot be used.
     """
     uri, sequence = _opened(plan)
     if plan.labels == "exact" and sequence.labels is None:
@@ -156,25 +143,15 @@ def compare(
         for name in plan.methods
     }
     run = partial(_run, cache=plan.cache, folder=Path.cwd())
-    size = next(iter(specs.values())).size
-    left, work, kinds = what_is_ahead(specs, sizes=len(competing_sizes(size, sequence.source_size)))
-    time_left = TimeLeft(work, kinds=kinds, workers=workers, now_s=time.monotonic())
-    flights = ResultCache(plan.cache / FLIGHTS)
-    before = at_last = flights.count()
-    running = {pool.submit(run, specs[one]): one for one in left}
+    # Those of most flights first, so that no process is left with one at the end.
+    order = sorted(specs, key=lambda one: _shapes(specs[one]), reverse=True)
+    running = {pool.submit(run, specs[one]): one for one in order}
     done: dict[_Run, dict[str, Any]] = {}
+    on_run(0, len(specs))
     try:
-        while left:
-            flown = flights.count() - before
-            left_s = time_left.left_s(now_s=time.monotonic())
-            on_flights(flown, max(flown, at_last - before + sum(left.values())), left_s)
-            unfinished = [future for future, one in running.items() if one in left]
-            for future in wait(unfinished, timeout=_REPORT_EVERY_S, return_when=FIRST_COMPLETED).done:
-                done[running[future]] = future.result()
-                del left[running[future]]  # which may have taken fewer flights than expected
-                at_last = flights.count()
-                time_left.ended(running[future], flown=at_last - before, now_s=time.monotonic())
-        on_flights(at_last - before, at_last - before, 0.0)
+        for future in as_completed(running):
+            done[running[future]] = future.result()
+            on_run(len(done), len(specs))
     finally:
         for future in running:
             future.cancel()
@@ -188,69 +165,10 @@ def _run(spec: RunSpec, *, cache: Path, folder: Path) -> dict[str, Any]:
     return run_spec(spec, cache=cache, folder=folder)
 
 
-def what_is_ahead(
-    specs: Mapping[_Run, RunSpec], *, sizes: int
-) -> tuple[dict[_Run, int], dict[_Run, float], dict[_Run, tuple[str, ...]]]:
-    """(flights, work, kinds) of each run, in the order in which they are flown; work and kinds as of `TimeLeft`.
-
-    ``sizes`` is how many the base stream can have.
-    """
-    first, rest = _in_order(specs)
-    names = {name for _, name in specs}
-    flights = dict.fromkeys(first, 1) | {
-        one: _distinct_flights(specs[one], beside=names, sizes=sizes) for one in rest
-    }
-    work = {one: count * _work_of_a_flight(specs[one]) for one, count in flights.items()}
-    return flights, work, {one: (one[1], _kind(METHODS[specs[one].method])) for one in flights}
-
-
-def _distinct_flights(spec: RunSpec, *, beside: Collection[str], sizes: int) -> int:
-    """About how many flights a run takes that no other run of its rate takes too."""
+def _shapes(spec: RunSpec) -> tuple[bool, int]:
+    """How much is tried for the best of it."""
     method = METHODS[spec.method]
-    if method.any_size:
-        return len(method.fps_choices) + _AT_A_SIZE * min(sizes - 1, _TRIED_SIZES)
-    best = (METHODS[COMPARED[one][0]] for one in beside)
-    if any(one.any_size and one.flags == method.flags for one in best):
-        return 0  # it is among those of the best one
-    return max(1, len(method.fps_choices))
-
-
-def _work_of_a_flight(spec: RunSpec) -> float:
-    """The work of one of the run's flights relative to others of its kind: fewer bits and fewer frames take less.
-
-    The powers are those of 70 flights of a comparison from 150 to 800 kbps and from 15 frames a second to one.
-    """
-    choices = METHODS[spec.method].fps_choices or (NOMINAL_FPS,)
-    pace = sum((fps / NOMINAL_FPS) ** _FPS_POWER for fps in choices) / len(choices)
-    return float(spec.budget_bps**_RATE_POWER * pace)
-
-
-def _in_order(specs: Mapping[_Run, RunSpec]) -> tuple[list[_Run], list[_Run]]:
-    """First runs that fly once at one rate, so that the time of flights of each kind is known soon.
-
-    Then those of several flights, so that no process is left with one at the end.
-    """
-    methods = {one: METHODS[spec.method] for one, spec in specs.items()}
-    of_kind: Counter[str] = Counter()
-    first: dict[_Run, tuple[bool, int]] = {}
-    for one in reversed(list(specs)):
-        kind = _kind(methods[one])
-        if one[0] == next(iter(specs))[0] and not methods[one].fps_choices:
-            first[one] = kind == "video", of_kind[kind]
-            of_kind[kind] += 1
-    rest = sorted(
-        (one for one in specs if one not in first),
-        key=lambda one: (methods[one].any_size, len(methods[one].fps_choices)),
-        reverse=True,
-    )
-    return sorted(first, key=lambda one: first[one]), rest
-
-
-def _kind(method: Method) -> str:
-    """The part that decides most of the time of a flight: the perception of the edge."""
-    if "source" in method.flags:
-        return "source"
-    return "video" if method.flags == METHODS["M0"].flags else "decoded"
+    return method.any_size, len(method.fps_choices)
 
 
 def _opened(plan: ComparePlan) -> tuple[str, Sequence]:

@@ -17,7 +17,7 @@ from uuid import uuid4
 
 from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import Channel
-from hvt_study.cache.results import FLIGHTS, CacheError, ResultCache, content_key
+from hvt_study.cache.results import CacheError, ResultCache, content_key
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.flights.flight import FlightReport
 from hvt_study.metrics import observed
@@ -199,7 +199,7 @@ class _Flights:
 
     def __init__(self, spec: RunSpec, cache: Path, found: Materials, here: RunSpec) -> None:
         self._spec, self._folder, self._found, self._here = spec, cache, found, here
-        self._cache = ResultCache(cache / FLIGHTS)
+        self._cache = ResultCache(cache / "flights")
         self.wall_s = 0.0
 
     def best(self) -> RunRow:

@@ -47,7 +47,7 @@ def test_what_cannot_be_flown_is_one_sentence(tmp_path, capsys, arguments, said)
     text = capsys.readouterr().err
     assert said in text
     assert "Traceback" not in text
-    assert len([line for line in text.strip().splitlines() if not line.startswith("flights: ")]) == 1
+    assert len([line for line in text.strip().splitlines() if not line.startswith("runs: ")]) == 1
 
 
 @pytest.mark.parametrize("methods", ["M5-jpeg", pytest.param("M0,M5-jpeg", marks=pytest.mark.nightly)])
