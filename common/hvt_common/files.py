@@ -9,6 +9,7 @@ import fcntl
 import logging
 import os
 import select
+import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -164,3 +165,26 @@ def _is_gone(path: Path) -> bool:
     except OSError:  # nobody may look there, which says nothing
         return False
     return False
+
+
+def claim_name(path: Path) -> bool:
+    """Whether the name was free: from now on it is ours, with an empty file, and no other process gets it.
+
+    True as well where no file can be made there; opening it tells why.
+    """
+    try:
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
+    except FileExistsError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def has_nothing(path: Path) -> bool:
+    """Whether there is no file of that name, or an empty one: never a device, a link or a pipe."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return not path.is_symlink()
+    return stat.S_ISREG(found.st_mode) and not found.st_size

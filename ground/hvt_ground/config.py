@@ -125,15 +125,6 @@ class GroundConfig:
     split: Limit | None = _FILES.option(
         _LIMIT, None, "begin a new file of the recording after this time or size, at the next keyframe"
     )
-    tracks: Path | None = _FILES.option(
-        PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
-    )
-    stills: Path | None = _FILES.option(
-        PATH, None, "also write each still as a picture, with a table of them: FILE.csv, or a folder"
-    )
-    timing: Path | None = _FILES_RARE.option(
-        PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
-    )
     view: bool = _FILES.switch("also open the Rerun viewer")
     serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
     metrics: str | None = _FILES.option(
@@ -149,8 +140,7 @@ class GroundConfig:
 
     @property
     def written(self) -> list[Written]:
-        suffixes = {"record": ".rrd", "tracks": ".csv", "stills": ".csv", "timing": "", "summary": ""}
-        given = ((f"--{name}", getattr(self, name), suffix) for name, suffix in suffixes.items())
+        given = (("--record", self.record, ".rrd"), ("--summary", self.summary, ""))
         return [(name, path, suffix) for name, path, suffix in given if path is not None]
 
     @property

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_ground.poses import Locator
     from hvt_ground.recordings.row import Recorded, RecordingRow
     from hvt_ground.report.state import GroundState
-    from hvt_ground.sinks import Outputs, SinkWriter
+    from hvt_ground.sinks import Outputs, Sink, SinkWriter
 
 Options = TypeVar("Options", bound=GroundConfig)
 
@@ -35,7 +35,7 @@ _BRINGS = {
     "cot": ("cot", "cot-types"),
     "mcap": ("mcap",),
     "terrain": ("terrain",),
-    "ground": ("ts", "keep", "keep-video", "log", "log-size"),
+    "ground": ("ts", "keep", "keep-video", "log", "log-size", "tracks", "stills", "timing"),
     "web": ("web", "web-proxy"),
 }
 _BROUGHT_BY = {setting: package for package, settings in _BRINGS.items() for setting in settings}
@@ -71,9 +71,12 @@ class Opening:
     """Whether an edge in lockstep waits for it; one that sends to others does not hold it up."""
     longest_pause_s: float = 60.0
     """The longest pause after a failure before it is made again."""
+    still_address: Callable[[Refinement, Path], str] | None = None
+    """Where its newest file has the picture of a still; empty where it has none."""
 
 
-OpenSinks = Callable[[Flight], Iterable[Opening]]
+OpenSinks = Callable[[Flight], "Iterable[Opening | Sink[Event]]"]
+"""Sinks to open, and such as take each event at once, in any thread."""
 
 
 def part_of(extra: object) -> str:

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
+from hvt_common.files import has_nothing
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, all_extras, checked, config_class
-from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.wiring import check_outputs, make_folders, output_path, set_aside
 from hvt_ground.wiring.sessions import backlog_path, free_path
 
@@ -40,7 +40,7 @@ def test_without_flags_it_listens_and_needs_no_model():
     [
         (["--labels", "names.txt", "--classifier", "detector"], "--classifier is no file"),
         (["--timing", "a.csv", "--tracks", "./a.csv"], "--tracks and --timing both name a.csv: give each"),
-        (["--timing", "a.csv", "--summary", "b/../a.csv"], "--timing and --summary both name b/../a.csv"),
+        (["--timing", "a.csv", "--summary", "b/../a.csv"], "--summary and --timing both name a.csv"),
         (["--record", "a.rrd", "--summary", "a.rrd"], "--record and --summary both name a.rrd"),
         (["--ts", "a.ts", "--summary", "./a.ts"], "--summary and --ts both name a.ts"),
     ],

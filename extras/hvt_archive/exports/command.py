@@ -21,14 +21,14 @@ import pyarrow.parquet as pq
 
 from hvt_archive.exports.maps import write_geojson, write_kml
 from hvt_archive.exports.pictures import write_coco, write_stills
+from hvt_archive.exports.tables import TRACK_COLUMNS, plain_cells, track_rows
 from hvt_archive.exports.video import CONTAINERS, write_video
 from hvt_archive.reading.recorded import read_recordings
 from hvt_common.errors import Parser, UserError, check_not_read
+from hvt_common.files import claim_name
 from hvt_common.runtime.reporting import say
 from hvt_ground.extras import all_extras, locators
 from hvt_ground.recordings.row import Recorded
-from hvt_ground.sinks.event_tables import TRACK_COLUMNS, plain_cells, track_rows
-from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.rerun.stills import still_of_event
 
 _BATCH_ROWS = 100_000
@@ -45,7 +45,7 @@ _TYPES = {
 
 
 def write_csv(recorded: Recorded, path: Path) -> None:
-    """One line a track and frame, the columns of `hvt_ground.sinks.event_tables`."""
+    """One line a track and frame, the columns of `hvt_archive.exports.tables`."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(TRACK_COLUMNS)

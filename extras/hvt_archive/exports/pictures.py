@@ -10,12 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hvt_archive.exports.tables import plain_cells
 from hvt_archive.exports.video import pictures
 from hvt_common.errors import UserError
 from hvt_common.units import utc_text
 from hvt_ground.events import Overlay
 from hvt_ground.recordings.row import Recorded
-from hvt_ground.sinks.event_tables import plain_cells
 
 STILL_COLUMNS = ("file", "base_file", "frame_index", "capture_utc", "caption")
 """``base_file`` shows the base stream at that place, empty where the recording has none; ``frame_index`` is

@@ -25,14 +25,13 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from mcap_protobuf.writer import Writer
 
 from hvt_common.errors import telling
-from hvt_common.files import check_there
+from hvt_common.files import check_there, has_nothing
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 from hvt_gateways.decodable import DecodableRun
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Shown, VideoSample
 from hvt_ground.recordings.row import RecordedStill
 from hvt_ground.sinks import SinkWriter
-from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.palette import Rgb, class_colour
 from hvt_ground.sinks.rerun.stills import event_text, still_picture
 

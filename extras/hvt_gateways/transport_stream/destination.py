@@ -18,9 +18,8 @@ import av
 import av.error
 
 from hvt_common.errors import UserError, named_path, telling
-from hvt_common.files import check_there
+from hvt_common.files import check_there, has_nothing
 from hvt_common.runtime.host_names import is_group, with_small_scheme
-from hvt_ground.sinks.line_file import has_nothing
 
 _log = logging.getLogger(__name__)
 

@@ -18,10 +18,10 @@ from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 
+from hvt_common.files import claim_name
 from hvt_common.units import SECOND_NS, Limit
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, VideoSample
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.queued import SinkWriter
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.recording_file import RecordingFile

@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hvt_common.errors import NotYetError, UserError
+from hvt_common.files import claim_name, has_nothing
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.edge_backlog import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
-from hvt_ground.extras import Flight, Service, extras_of, locators, part_of, written
+from hvt_ground.extras import Flight, Opening, Service, extras_of, locators, part_of, written
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.recordings.row import RecordingRow
@@ -31,8 +32,6 @@ from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
-from hvt_ground.sinks.event_tables import SessionTiming, StillFiles, TrackTable, picture_of, timing_table
-from hvt_ground.sinks.line_file import claim_name, has_nothing
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.rrd_file import locked
@@ -108,7 +107,7 @@ def set_aside(config: GroundConfig) -> None:
             continue
         # Beside it: the pictures of a table of stills, the older half of a log.
         stem = escape(file.stem)
-        beside = [f"{stem}-[0-9]*.png"] if name == "--stills" else [f"{stem}-before{escape(file.suffix)}"]
+        beside = [f"{stem}-[0-9]*.png"] if suffix == ".csv" else [f"{stem}-before{escape(file.suffix)}"]
         folder = file.with_name(free)
         try:
             if not file.stat().st_size:
@@ -188,6 +187,8 @@ S = TypeVar("S", bound=SinkWriter[Any])
 
 OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
 """Opens a sink for a session."""
+_Pictures = tuple[QueuedSink[Event], Callable[[Refinement, Path], str]]
+"""A sink, and where its newest file has the picture of a still."""
 
 _LIVE_PAUSE_S = 5.0
 """The longest pause before a failed live view is tried again."""
@@ -222,10 +223,6 @@ class SessionFactory:
             *((part_of(one), one.sinks) for one in self.services),
             *((part_of(one), one.start(self.config, self.outputs)) for one in extras_of(self.config)),
         ]
-        self._timing: QueuedSink[str] | None = None
-        if self.config.timing is not None:
-            names = partial(free_path, [self.config.timing], number=2, may_exist=self.config.timing)
-            self._timing = self.outputs.open("timing table", partial(self._opened, timing_table, names))
 
     def open_session(self, info: Info, reports: ReceiverReports) -> Session:
         config, models, edge = self.config, self.models, info.edge
@@ -247,29 +244,25 @@ class SessionFactory:
         if self.view is not None:
             open_live = partial(_live_recorder, settings, self.view)
             sinks.append(self.outputs.open(f"live view of {edge}", open_live, longest_pause_s=_LIVE_PAUSE_S))
-        files: dict[str, QueuedSink[Event]] = {}
-        for target, what, suffix, make in (
-            (config.tracks, "tracks table", ".csv", TrackTable),
-            (config.stills, "stills", ".csv", StillFiles),
-        ):
-            if target is not None:
-                open_file = self._new_file(target, suffix, make, edge=edge, stamp=stamp)
-                files[what] = self.outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s)
-        sinks += files.values()
+        pictures: list[_Pictures] = []
         flight = Flight(
             info,
             locator=locator,
             clock=self.clock,
             new_file=partial(self._new_file, edge=edge, stamp=stamp),
-            still_address=self._still_address(info, files.get("stills")),
+            still_address=partial(self._still_address, info, pictures),
         )
         brought = (models.failures.attempt(part, opens, (), flight) for part, opens in self._extras)
         for one in chain.from_iterable(brought):
+            if not isinstance(one, Opening):
+                sinks.append(one)
+                continue
             pause_s = one.longest_pause_s
             held_s = wait_s if one.waits else 0.0
-            sinks.append(self.outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
-        if self._timing is not None:
-            sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
+            sink = self.outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s)
+            sinks.append(sink)
+            if one.still_address is not None:
+                pictures.append((sink, one.still_address))
         perception = SessionPerception(config, models, info)
         return Session(
             info,
@@ -297,17 +290,11 @@ class SessionFactory:
         names = partial(output_path, target, suffix=suffix, edge=edge, stamp=stamp)
         return partial(self._opened, make, names)
 
-    def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> Callable[[Refinement], str]:
-        # Where the picture of a still is: with a service, else in the folder of ``--stills``, else nowhere.
-        def address(still: Refinement) -> str:
-            for one in self.services:
-                if found := one.still_address(info, still):
-                    return found
-            if files is None or not files.files or still.still_bgr is None or still.crop_base_px is None:
-                return ""
-            return str(picture_of(still, files.files[-1].resolve()))
-
-        return address
+    def _still_address(self, info: Info, pictures: Sequence[_Pictures], still: Refinement) -> str:
+        # Where the picture of a still is: with a service, else in a file, else nowhere.
+        found = (one.still_address(info, still) for one in self.services)
+        in_files = (address(still, sink.files[-1]) for sink, address in pictures if sink.files)
+        return next(filter(None, chain(found, in_files)), "")
 
     def _files(
         self, settings: RecorderSettings, *, split: Limit | None = None, backlog: bool = False
@@ -332,8 +319,7 @@ class SessionFactory:
 
     def _give_up(self, path: Path) -> None:
         self._paths.discard(path)
-        config = self.config
-        if path not in (config.record, config.tracks, config.stills) and has_nothing(path):
+        if all(path != named for _, named, _ in written(self.config)) and has_nothing(path):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
 

@@ -1,4 +1,4 @@
-"""Reads the table of `hvt-ground --timing` (see `hvt_ground.sinks.event_tables`)."""
+"""Reads the table of `hvt-ground --timing` (see `hvt_archive.exports.tables`)."""
 
 import csv
 from dataclasses import dataclass

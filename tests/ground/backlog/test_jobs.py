@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from hvt_archive.exports.tables import LineFile
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_ground.backlog.edge_backlog import BacklogRecording, BacklogRecordings
@@ -21,7 +22,6 @@ from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job
 from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.line_file import LineFile
 from hvt_ground.sinks.queued import SinkWriter
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object

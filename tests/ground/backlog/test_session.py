@@ -14,6 +14,7 @@ import av
 import numpy as np
 import pytest
 
+from hvt_archive.exports.tables import SessionTiming, timing_table
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.ledger import Account
 from hvt_common.protocol.messages import (
@@ -36,7 +37,6 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
-from hvt_ground.sinks.event_tables import SessionTiming, timing_table
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import SLOTS
 from programs.processes import eventually

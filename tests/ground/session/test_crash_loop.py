@@ -17,13 +17,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from hvt_archive.exports.extra import TableOptions
 from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import BacklogRecordings
-from hvt_ground.config import GroundConfig, check
+from hvt_ground.config import check
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import status_text, summary
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -129,7 +130,7 @@ class Restarted:
 @contextmanager
 def served(link: GroundLink, folder: Path, ended: list[str], clock: Clock) -> Iterator[EdgeSessions]:
     """The edge's thread with sessions as `hvt-ground` makes them; ``ended`` gets one word a session."""
-    config = check(GroundConfig(record=folder, tracks=folder, detector="motion", classifier="none"))
+    config = check(TableOptions(record=folder, tracks=folder, detector="motion", classifier="none"))
     outputs, models = Outputs(Failures(time.time_ns)), Models(config)
     factory = SessionFactory(config, models, clock=clock, outputs=outputs, view=None)
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from hvt_archive.exports.tables import TrackTable
 from hvt_common.errors import UserError
 from hvt_ground.events import Notice, Overlay
-from hvt_ground.sinks.event_tables import TrackTable
 from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_study.datasets.labels import FrameLabels

@@ -29,9 +29,8 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError, telling
-from hvt_common.files import check_there
+from hvt_common.files import check_there, has_nothing
 from hvt_common.runtime.failures import Turns
-from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 _log = logging.getLogger(__name__)

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from hvt_archive.exports.tables import TIMING_COLUMNS, LineFile, SessionTiming, timing_table
 from hvt_common.errors import UserError
 from hvt_ground.events import MessageTiming, StillsRead
-from hvt_ground.sinks.event_tables import TIMING_COLUMNS, SessionTiming, timing_table
-from hvt_ground.sinks.line_file import LineFile
 
 
 def message(kind: str = "base", *, sequence: int, handled_ns: int | None = 3_000) -> MessageTiming:
@@ -95,7 +94,7 @@ def test_a_folder_that_goes_is_noticed(tmp_path):
 WRITER = r"""
 import sys, time
 from pathlib import Path
-from hvt_ground.sinks.event_tables import timing_table
+from hvt_archive.exports.tables import timing_table
 table = timing_table(Path(sys.argv[1]))
 for number in range(10**9):
     table.log(f"base,{number}\n")

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_archive.exports.tables import StillFiles, TrackTable
 from hvt_common.errors import UserError
-from hvt_ground.sinks.event_tables import StillFiles, TrackTable
 from rigs.examples import overlay, refinement
 from rigs.messages import PLAIN
 

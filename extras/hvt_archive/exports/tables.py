@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,11 +18,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hvt_common.errors import telling
+from hvt_common.errors import UserError, telling
+from hvt_common.files import check_there, has_nothing
 from hvt_common.units import utc_text
 from hvt_ground.events import Event, MessageTiming, Overlay, Places, Refinement, StillsRead
-from hvt_ground.sinks.line_file import LineFile
-from hvt_ground.sinks.queued import Sink, SinkWriter
+from hvt_ground.sinks import Sink, SinkWriter
 
 TRACK_COLUMNS = (
     *("frame_index", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
@@ -50,6 +51,44 @@ _FORMULA = re.compile(r"\s*([=@\uff1d\uff20]|[+\uff0b\uff0d-](?!\d+(\.\d+)?$))")
 def plain_cells(row: Iterable[object]) -> tuple[object, ...]:
     """A row for CSV; before a name such as ``=1+1``, which may come from the wire, stands an apostrophe."""
     return tuple(f"'{one}" if isinstance(one, str) and _FORMULA.match(one) else one for one in row)
+
+
+class LineFile(SinkWriter[str]):
+    """A new file with a first line of ``columns``; comma-separated. Takes the place of one of that name.
+
+    Raises `UserError` where it cannot be created, or (from `log`) written any further.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        self.path: Path = path
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
+        self._size_bytes, fresh = 0, has_nothing(path)
+        with telling(f"table {path} cannot be created: "):
+            self._file = os.open(path, flags, 0o644)
+        try:
+            self.log(",".join(columns) + "\n")
+        except UserError:
+            self.close()
+            if fresh:
+                path.unlink(missing_ok=True)
+            raise
+
+    def log(self, item: str) -> None:
+        data = item.encode()
+        try:
+            check_there(self._file, self.path)
+            while data:
+                data = data[os.write(self._file, data) :]
+        except OSError as error:
+            with suppress(OSError):  # half a line
+                os.ftruncate(self._file, self._size_bytes)
+            raise UserError(f"table {self.path} cannot be written any further: {error.strerror}") from error
+        self._size_bytes += len(item.encode())
+
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
 
 
 class _EventTable(SinkWriter[Event]):
@@ -91,7 +130,7 @@ class StillFiles(_EventTable):
         """Write a still; `UserError` where there is no room for it."""
         if not isinstance(item, Refinement) or item.still_bgr is None or item.crop_base_px is None:
             return
-        picture = picture_of(item, self.path)
+        picture = _picture_of(item, self.path)
         if item.still_sequence != self._last:
             _, data = cv2.imencode(".png", item.still_bgr)
             with telling(f"still {picture} cannot be written: "):
@@ -138,8 +177,14 @@ def _write_whole(picture: Path, data: bytes) -> None:
         raise
 
 
-def picture_of(still: Refinement, table: Path) -> Path:
-    """The picture of a still, beside the table; it is there where the still was decoded and has a place."""
+def address_of(still: Refinement, table: Path) -> str:
+    """Where the picture of a still is, beside the table; empty where it was not decoded, or has no place."""
+    if still.still_bgr is None or still.crop_base_px is None:
+        return ""
+    return str(_picture_of(still, table.resolve()))
+
+
+def _picture_of(still: Refinement, table: Path) -> Path:
     return table.with_name(f"{table.stem}-{still.still_sequence:06d}.png")
 
 
