@@ -1,1 +1,1 @@
-"""Still codecs that no profile uses, behind the entry point `hvt.still_codecs`: `webp`, `avif`, `jxl`."""
+"""Codecs that no profile uses: of stills `webp`, `avif`, `jxl`, behind `hvt.still_codecs`; of video `hardware`."""

@@ -43,6 +43,8 @@ def loaded(entry: EntryPoint, make: Callable[[Any], Any], *, what: str) -> Any:
     """The result of ``make`` for the entry's object; `UserError` for whatever foreign code raises."""
     try:
         return make(entry.load())
+    except UserError:  # its own sentence
+        raise
     except foreign() as error:
         raise UserError(
             f"{what} {entry.name!r} of {origin(entry)} does not load: {type(error).__name__}: {error}"

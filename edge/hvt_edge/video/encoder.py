@@ -1,16 +1,15 @@
 """The frame loop's contract with an encoder, its settings from a budget in line bits, and all encoders by name.
 
-There are x265, none (passthrough), hardware encoders, and those that other packages install: an entry point of the
-group ``hvt.encoders`` (`MakeEncoder`), imported when it is named.
+There are x265, none (passthrough), and those that packages install, as an extra the hardware encoders: an entry point
+of the group ``hvt.encoders`` (`MakeEncoder`), imported when it is named.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Protocol
 
 from hvt_common.errors import UserError
@@ -241,51 +240,18 @@ class CheckedEncoder:
         del self._encoder
 
 
-@dataclass(frozen=True, slots=True)
-class HardwareRow:
-    """One encoder of FFmpeg."""
-
-    codec: str
-    """Its name in FFmpeg, and for ``--encoder``."""
-    pixel_format: str
-    needs: str
-    """The hardware that it needs."""
-    options: Mapping[str, str] = field(default_factory=dict)
-    """Options for zero latency, constant rate, and an IDR where a keyframe is forced."""
-
-
 GROUP = "hvt.encoders"
 X265 = "x265"
 """HVT's own, measured encoder: the only one that takes regions and needs no qualification."""
 PASSTHROUGH = "passthrough"
 """No encoder: the units come from a camera that makes HEVC itself."""
 _WHAT = "encoder"
-
-
-# The project has run none of them: the rows were written from FFmpeg's documentation. The qualification run at the
-# start keeps a wrong row from a flight.
-_ROWS = (
-    HardwareRow(
-        "hevc_nvenc",
-        "yuv420p",
-        "an NVIDIA GPU with NVENC and its driver",
-        {"preset": "p4", "tune": "ull", "rc": "cbr", "delay": "0", "zerolatency": "1", "forced-idr": "1"},
-    ),
-    HardwareRow(
-        "hevc_qsv",
-        "nv12",
-        "an Intel GPU with Quick Sync and its driver",
-        {"preset": "medium", "async_depth": "1", "low_delay_brc": "1", "look_ahead": "0", "forced_idr": "1"},
-    ),
-    HardwareRow("hevc_v4l2m2m", "nv12", "a board whose kernel has an HEVC encoder as a V4L2 device"),
-)
-HARDWARE: Mapping[str, HardwareRow] = MappingProxyType({row.codec: row for row in _ROWS})
-_OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
+_OWN = (X265, PASSTHROUGH)
 
 
 def encoder_names() -> tuple[str, ...]:
     """The values of ``--encoder`` here: HVT's own first, whether or not the device is there; none is loaded."""
-    return (X265, PASSTHROUGH, *HARDWARE, *sorted(installed(GROUP).keys() - _OWN))
+    return (*_OWN, *sorted(installed(GROUP).keys() - set(_OWN)))
 
 
 def check_encoder(name: str) -> None:
@@ -299,7 +265,6 @@ def check_encoder(name: str) -> None:
 def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     """Open the encoder. Raises `UserError` if there is none, or it does not load or refuses the settings."""
     # Imported only to open one: at each start only names are checked.
-    from hvt_edge.video.hardware import HardwareEncoder  # noqa: PLC0415
     from hvt_edge.video.passthrough import Passthrough  # noqa: PLC0415
     from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
 
@@ -308,8 +273,6 @@ def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     if name == PASSTHROUGH:
         return Passthrough()
     check_encoder(name)
-    if name in HARDWARE:
-        return CheckedEncoder(HardwareEncoder(settings, row=HARDWARE[name]))
     entry = the_one(GROUP, name, what=_WHAT, built_in=False)
     assert entry is not None, "checked"
     return CheckedEncoder(loaded(entry, lambda make: make(settings), what=_WHAT))

@@ -1,4 +1,4 @@
-"""Encoders that other packages install, and those of hardware: found by name, checked, refused in a sentence."""
+"""Encoders that other packages install: found by name, checked, refused in a sentence."""
 
 from __future__ import annotations
 
@@ -7,17 +7,13 @@ import math
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.video.hevc import BaseDecoder, nal_kind, nal_units
+from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder import (
-    HARDWARE,
-    CheckedEncoder,
     EncoderSettings,
-    HardwareRow,
     check_encoder,
     encoder_names,
     open_encoder,
 )
-from hvt_edge.video.hardware import HardwareEncoder
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
 from media.third_party import ENCODERS
@@ -47,7 +43,7 @@ def installed(packages):
 def test_another_encoder_makes_the_base_stream(installed):
     """The encoder of a board could not be used without changing HVT."""
     installed("Obedient")
-    assert encoder_names() == ("x265", "passthrough", *HARDWARE, "acme-obedient")
+    assert encoder_names()[:3] == ("x265", "passthrough", "acme-obedient")
     encoder, decoder = open_encoder("acme-obedient", SETTINGS), BaseDecoder(size=SIZE)
     units = coded(encoder, keyframes=(0, 4))
     assert [unit.keyframe for unit in units] == [True, False, False, False, True, False]
@@ -60,7 +56,7 @@ def test_another_encoder_makes_the_base_stream(installed):
 def test_a_name_that_nobody_brings_is_answered_with_those_that_are_there(installed):
     """A typing mistake would be searched for in the documents."""
     installed("Obedient")
-    says = "--encoder 'x266' is not known: choose one of x265, passthrough, hevc_nvenc, .*, acme-obedient$"
+    says = "--encoder 'x266' is not known: choose one of x265, passthrough, acme-obedient, hevc_nvenc, "
     with pytest.raises(UserError, match=says):
         check_encoder("x266")
 
@@ -89,50 +85,3 @@ def test_one_that_does_not_open_or_that_no_ground_could_use_is_an_error(installe
     installed(name)
     with pytest.raises(error, match=says):
         coded(open_encoder(f"acme-{name.lower()}", SETTINGS), keyframes=(0, 2))
-
-
-@pytest.mark.parametrize("row", HARDWARE.values(), ids=lambda row: row.codec)
-def test_hardware_that_is_not_there_is_refused(row):
-    """An edge would end with FFmpeg's internals, or fly without video."""
-    try:
-        HardwareEncoder(SETTINGS, row=row)
-    except UserError as error:
-        text = str(error)
-    else:
-        pytest.skip(f"this machine has {row.needs}")
-    assert text.startswith(f"--encoder {row.codec} does not open on this machine (")
-    assert text.endswith(f": it takes {row.needs}; x265 takes none")
-
-
-def test_the_class_behind_the_rows_codes():
-    """Nothing of it would have run before the first flight with a GPU; here x265 stands behind a row of its own."""
-    options = {"preset": "ultrafast", "tune": "zerolatency", "forced-idr": "1"}
-    options["x265-params"] = "log-level=none:repeat-headers=1:open-gop=0:bframes=0:min-keyint=1"
-    row = HardwareRow("libx265", "yuv420p", "nothing", options)
-    encoder, decoder = HardwareEncoder(SETTINGS, row=row), BaseDecoder(size=SIZE)
-    for frame, unit in zip(FRAMES, coded(encoder, keyframes=(0, 4)), strict=True):
-        assert unit.keyframe == (frame.index in (0, 4))
-        assert abs(decoder.decode(unit.data).astype(int) - frame.base_bgr).mean() < 8
-    assert 0 < encoder.mean_qp < 51
-
-
-def test_filler_is_left_out():
-    """A rate that a still scene does not need would be sent all the same."""
-    params = (
-        "log-level=none:repeat-headers=1:bframes=0:rc-lookahead=0:strict-cbr=1:vbv-maxrate=200:vbv-bufsize=30"
-    )
-    options = {"preset": "ultrafast", "tune": "zerolatency", "x265-params": params}
-    row, sizes = HardwareRow("libx265", "yuv420p", "nothing", options), []
-    for encoder in (HardwareEncoder(SETTINGS, row=row), CheckedEncoder(HardwareEncoder(SETTINGS, row=row))):
-        units = [encoder.encode(frame) for frame in framed(smooth_pictures(1, size=SIZE) * 15)]
-        sizes.append(sum(len(unit.data) for unit in units[1:]))
-        kinds = {nal_kind(nal) for unit in units for nal in nal_units(unit.data)}
-        assert (38 in kinds) is (len(sizes) == 1)
-    assert sizes[1] < 0.5 * sizes[0]
-
-
-def test_a_row_of_hardware_that_delays_is_an_error():
-    """Pictures would be older than their times say."""
-    row = HardwareRow("libx265", "yuv420p", "nothing", {"x265-params": "log-level=none"})
-    with pytest.raises(ValueError, match="libx265 gave 0 units for frame 0: it delays"):
-        coded(HardwareEncoder(SETTINGS, row=row), keyframes=(0,))

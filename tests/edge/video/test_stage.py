@@ -24,7 +24,6 @@ from hvt_edge.config import EdgeConfig, check, least_budget_bps
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.operating import Keyframes, KeyframeSettings, Rates
 from hvt_edge.video.encoder import CheckedEncoder, Encoder, EncoderPlan, EncoderSettings, encoder_settings
-from hvt_edge.video.hardware import HardwareEncoder
 from hvt_edge.video.rate_model import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.stage import Action, FrameDecision, FrameInputs, decide
@@ -187,7 +186,9 @@ def test_the_device_of_an_encoder_that_failed_is_free_before_each_try_to_open_an
     there: weakref.WeakSet[Encoder] = weakref.WeakSet()
     busy: list[int] = []
 
-    class Broken(HardwareEncoder):
+    class Broken:
+        mean_qp = 30.0
+
         def __init__(self) -> None:
             there.add(self)
 
