@@ -1,4 +1,4 @@
-"""The door for an extra for fleets, by the entry point ``hvt.link``: it explains links, and shares them out.
+"""The door for an extra for fleets, by the entry point ``hvt.link``: it explains links, mends and shares them.
 
 Without it nobody does.
 """
@@ -6,7 +6,7 @@ Without it nobody does.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Self, cast
 
 from hvt_common.errors import UserError
@@ -16,6 +16,7 @@ from hvt_common.runtime.plug_ins import loaded, the_one
 if TYPE_CHECKING:  # the configuration asks here, and a wrong setting is told without a link
     import zenoh
 
+    from hvt_common.runtime.failures import Failures
     from hvt_common.transport.zenoh_config import LinkSettings
 
 _GROUP = "hvt.link"
@@ -41,7 +42,7 @@ class LinkWatch:
 
 
 class LinkDoctor:
-    """Explains links, and shares edges out to grounds; this one does neither."""
+    """Explains and mends links, and shares edges out to grounds; this one does nothing."""
 
     def check_keys(
         self, config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float
@@ -69,6 +70,24 @@ class LinkDoctor:
         The context is a `hvt_ground.link.group.Group`. Raises `UserError` where nothing shares.
         """
         raise UserError("--group is of an extra that is not installed: pip install 'hvt[ground]'")
+
+    def mend(
+        self,
+        session: zenoh.Session,  # noqa: ARG002
+        config: zenoh.Config,  # noqa: ARG002
+        failures: Failures,  # noqa: ARG002
+        *,
+        on_deaf: Callable[[], None] | None,  # noqa: ARG002
+    ) -> AbstractContextManager[object]:
+        """Frees a session of sockets that a dark line leaves behind, until the context ends.
+
+        ``failures`` learns of a listener that hears nothing any more, and ``on_deaf()`` is called, in a thread.
+        """
+        return nullcontext()
+
+    def is_listening(self, endpoints: Sequence[str]) -> bool:  # noqa: ARG002
+        """Whether this process listens at each of these endpoints of Zenoh; True where nobody can say."""
+        return True
 
     def watch(
         self,

@@ -21,7 +21,6 @@ from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, 
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.link_doctor import link_doctor
-from hvt_common.transport.stale_sockets import StaleSockets, end_of, ends_of, listening_ends
 from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
 
 _log = logging.getLogger(__name__)
@@ -60,7 +59,7 @@ def open_session(
         if failures is not None:
             failures.works("listener")
     try:
-        with StaleSockets(session, config, failures or Failures(time.time_ns), on_deaf=on_deaf):
+        with link_doctor().mend(session, config, failures or Failures(time.time_ns), on_deaf=on_deaf):
             yield session
     finally:
         stop.set()
@@ -79,11 +78,10 @@ def _open_listening_later(
     except zenoh.ZError as error:
         raise UserError(_open_failure(str(error), listen, config)) from None
 
-    wanted = [end_of(endpoint) for endpoint in listen if re.search(r":[1-9]\d*([?#]|$)", endpoint)]
+    wanted = [endpoint for endpoint in listen if re.search(r":[1-9]\d*([?#]|$)", endpoint)]
 
     def bound() -> bool:
-        here = listening_ends()  # from Linux: Zenoh does not say when its listener has come
-        if not all(here & ends_of(end) for end in wanted):
+        if not link_doctor().is_listening(wanted):  # Zenoh does not say when its listener has come
             raise NotYetError(why)
         return True
 

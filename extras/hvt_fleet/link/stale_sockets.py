@@ -64,10 +64,11 @@ def connections(table: Path, *, inodes: Container[str] | None = None) -> Iterato
             yield Connection(_end(ours), _end(theirs), int(inode))
 
 
-def listening_ends() -> set[str]:
-    """Where sockets of this process listen or take datagrams."""
-    listening = {end for end, state in _own(TCP_TABLES) if state == _LISTENING}
-    return listening | {end for end, _ in _own(UDP_TABLES)}
+def is_listening(endpoints: Iterable[str]) -> bool:
+    """Whether sockets of this process listen, or take datagrams, at each of these endpoints of Zenoh."""
+    here = {end for end, state in _own(TCP_TABLES) if state == _LISTENING}
+    here |= {end for end, _ in _own(UDP_TABLES)}
+    return all(here & ends_of(end_of(one)) for one in endpoints)
 
 
 def _own(tables: Iterable[Path]) -> Iterator[tuple[str, str]]:
