@@ -21,6 +21,7 @@ from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import FailingDetector, open_detector, warm_up
 from hvt_common.inference.labels import default_confidence, is_calibrated, uncalibrated
 from hvt_common.inference.retried import RetriedClassifier, RetriedDetector
+from hvt_common.inference.store import needed_part
 from hvt_common.inference.view_trust import trust_from
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -29,6 +30,7 @@ from hvt_common.tracking.settings import weak_confidence
 from hvt_common.values import Detections
 from hvt_common.video.hevc import Picture
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
+from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.vocabulary import check_common
 
 
@@ -115,6 +117,8 @@ class ModelFacts:
     """Whether the model that reads stills gives probabilities."""
     trust_from: float | None = None
     """As of `ViewTrust`."""
+    redetection: Callable[..., StillReader] | None = None
+    """Makes the reader of stills that is the detector again, from it and the ``view``; None for another."""
 
     @classmethod
     def of(cls, config: GroundConfig) -> Self:
@@ -128,6 +132,7 @@ class ModelFacts:
             if reader == DETECTOR
             else reader not in (None, NONE) and is_calibrated(reader, role="classifier"),
             trust_from(config.detector),
+            needed_part("redetection", f"--classifier {DETECTOR}") if reader == DETECTOR else None,
         )
 
 

@@ -22,7 +22,7 @@ from hvt_common.runtime.failures import Turns
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Image
-from hvt_ground.config import DETECTOR, GroundConfig
+from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
@@ -30,7 +30,7 @@ from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.pipeline import Pipeline
-from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
+from hvt_ground.perception.stills.classify import CropReader, NoReader, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ViewTilt
 from hvt_ground.perception.stills.stage import Progress, StillStage
@@ -159,9 +159,8 @@ class SessionPerception:
         view = self._info.view
         if classifier is not None:
             return detector, CropReader(classifier, view=view)
-        return detector, Redetection(
-            detector, view=view
-        ) if self._config.classifier == DETECTOR else NoReader()
+        redetection = self._models.facts.redetection
+        return detector, NoReader() if redetection is None else redetection(detector, view=view)
 
     def _fusion(self, edge_classes: npt.NDArray[np.int32], path: CameraPath) -> Fusion:
         info = self._info

@@ -14,8 +14,8 @@ from hvt_common.values import Image, View
 from hvt_common.video.still_codecs import BaseMissingError, StillError
 from hvt_ground.perception.history import as_bgr
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
-from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import DecodedStill, decode_still
+from hvt_models.redetection import composite
 from hvt_scene import CodeInView
 from hvt_study.reading.score import LEAST_VISIBLE, Code, CodeReader, Evidence, code_crop, share_inside
 

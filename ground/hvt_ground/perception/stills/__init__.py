@@ -1,5 +1,4 @@
 """A still at the ground: `stage` takes it through `decode`, `classify` and `refine`, which finds its track.
 
-`vocabulary` maps a classifier's words to classes of tracks, `posterior` when it is sure; `composite` lays them
-over the base picture.
+`vocabulary` maps a classifier's words to classes of tracks, `posterior` when it is sure.
 """

@@ -18,11 +18,10 @@ from hvt_ground.perception.stills.classify import (
     CropReader,
     NoReader,
     ObjectReading,
-    Redetection,
     object_crops,
 )
-from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import DecodedStill
+from hvt_models.redetection import Redetection, composite
 from media.onnx_models import colour_classifier
 from rigs.examples import detections
 

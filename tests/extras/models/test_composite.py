@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.values import Image, View
-from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import DecodedStill
+from hvt_models.redetection import composite
 
 SOURCE, BASE = (1280, 720), (320, 180)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
