@@ -110,7 +110,7 @@ def _print(sessions: list[dict[str, Any]]) -> None:
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if not sessions:
-        say("hvt-ground: no edge was heard")
+        say("hvt-ground: no picture of an edge came")
 
 
 if __name__ == "__main__":

@@ -303,4 +303,4 @@ def test_a_summary_that_cannot_be_written_any_more_is_code_1(command: list[str],
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stderr
     assert done.stderr == "hvt-ground: /dev/full cannot be written (No space left on device)\n"
-    assert done.stdout == "hvt-ground: no edge was heard\n", "what is known is told first"
+    assert done.stdout == "hvt-ground: no picture of an edge came\n", "what is known is told first"

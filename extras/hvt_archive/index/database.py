@@ -10,6 +10,7 @@ import sqlite3
 import time
 from collections.abc import Iterable
 from contextlib import closing
+from os.path import samestat
 from pathlib import Path
 
 from hvt_common.errors import UserError
@@ -57,14 +58,13 @@ class Index:
         except sqlite3.DatabaseError as error:
             _set_aside(path, error)
             self._database = _opened(path)
+        self._file = path.stat()
 
     def close(self) -> None:
         """Close it; a second call does nothing."""
         self._database.close()
 
     def put(self, row: RecordingRow) -> None:
-        if not self._path.exists():  # the row would be in no file
-            raise sqlite3.OperationalError(f"{self._path} was removed")
         values = [getattr(row, name) for name in _COLUMNS]
         with self._database as transaction:
             transaction.execute(
@@ -93,6 +93,8 @@ class Index:
         So the files keep their ages and their order when the clock is set. The first to look with another clock
         moves them, of all grounds that have the folder.
         """
+        if not self._is_there():  # all its files would seem to be gone, and what is noted would be in no folder
+            raise sqlite3.OperationalError(f"{self._path} was removed")
         with self._database as transaction:
             transaction.execute("BEGIN IMMEDIATE")
             before = transaction.execute("SELECT unix_ns, boot, steady_ns FROM looked").fetchone()
@@ -102,6 +104,13 @@ class Index:
             transaction.execute("DELETE FROM looked")
             transaction.execute("INSERT INTO looked VALUES (?, ?, ?)", [now.unix_ns, now.boot, now.steady_ns])
         return moved_ns
+
+    def _is_there(self) -> bool:
+        # Or its disk was unmounted: then the folder is another, and may have an index of its own.
+        try:
+            return samestat(self._path.stat(), self._file)
+        except FileNotFoundError:
+            return False
 
     def rows(self, *, classes: bool = True) -> list[RecordingRow]:
         """All files, in the order of their times; without ``classes`` it is quicker where there are many."""

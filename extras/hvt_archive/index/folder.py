@@ -18,6 +18,7 @@ from hvt_archive.index.retention import Retention, due, is_own_name
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import Moment, boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS
 from hvt_ground.control import EdgeClient
 from hvt_ground.extras import Service
@@ -38,7 +39,8 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
     """Writes the index; a sink for one thread. Files are removed when one was closed, or an item is None.
 
     At the beginning it is compared with the folder: files that are gone are forgotten, those that a killed
-    program left are read, and so are those that it does not know, as far as they have a name of ours.
+    program left are read, and so are those that it does not know, as far as they have a name of ours. Thousands take
+    minutes: once ``stop`` is set, the rest is left to the next beginning.
 
     A wall clock may be years off, and be set at any time: ages count the time since the index learned of a file,
     which is that of the boot's own clock (`Index.pass_time`). For its age one file goes at a time.
@@ -54,6 +56,7 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         *,
         now_ns: Callable[[], int] = time.time_ns,
         since_boot: Callable[[], tuple[str, int]] = lambda: (boot_id(), since_boot_ns()),
+        stop: threading.Event | None = None,
     ) -> None:
         self._folder = folder
         self._retention = retention
@@ -66,8 +69,8 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         self._index = Index(folder)
         try:
             now = self._pass_time()
-            self._compare(now.unix_ns)
-            self._remove_due(now)
+            if self._compare(now.unix_ns, stop or threading.Event()):
+                self._remove_due(now)
         except BaseException:
             self._index.close()
             raise
@@ -91,11 +94,14 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
             self._doubted_ns = now.steady_ns
         return now
 
-    def _compare(self, now_ns: int) -> None:
+    def _compare(self, now_ns: int, stop: threading.Event) -> bool:
+        # Whether it came to the end.
         known = {row.file: row for row in self._index.rows()}
         there = {one.name for one in self._folder.glob("*.rrd") if one.is_file() and not one.is_symlink()}
         self._index.forget(known.keys() - there)
         for name in sorted(there):
+            if stop.is_set():
+                return False
             row, path = known.get(name), self._folder / name
             if row is None and not is_own_name(name):
                 continue
@@ -114,6 +120,7 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
                 self._index.put(replace(found, written_ns=now_ns if row is None else row.written_ns))
             elif row is not None:
                 self._index.put(replace(row, size_bytes=path.stat().st_size, whole=True))
+        return True
 
     def _remove_due(self, now: Moment) -> None:
         retention = self._retention
@@ -185,11 +192,15 @@ class RecordingsFolder(Service):
     def begin(self, client: EdgeClient | None = None) -> None:  # noqa: ARG002 - no edge is asked
         self._sink = QueuedSink(
             "recordings index",
-            lambda: IndexWriter(self._folder, self._retention),
+            self._opened,
             failures=self._failures,
             unhurried=True,
         )
         self._clock.start()
+
+    def _opened(self) -> IndexWriter:
+        lower_priority()  # with the programs that read files and remove video: live video goes before them
+        return IndexWriter(self._folder, self._retention, stop=self._stop)
 
     def recorded(self, row: RecordingRow) -> None:
         if self._sink is not None:

@@ -67,8 +67,10 @@ def why_no_link(endpoint: str, files: TlsFiles) -> str:
         match found["protocol"]:
             case "tls":
                 reason = _tls(place, files)
-            case "udp" | "quic":
+            case "udp":
                 reason = _datagrams(place)
+            case "quic":  # RFC 9000 section 14: UDP payloads of 1200 bytes
+                reason = _datagrams(place) + "; QUIC needs a path that carries packets of 1280 bytes"
             case protocol:
                 reason = _plain(place, protocol)
     except UnicodeError:  # a part of a name has 63 characters at most

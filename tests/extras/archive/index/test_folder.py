@@ -7,6 +7,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +21,7 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 
-from hvt_archive.index import folder
+from hvt_archive.index import files, folder
 from hvt_archive.index.database import INDEX, read_index
 from hvt_archive.index.files import claimed, is_claimed, remove_video
 from hvt_archive.index.folder import IndexWriter, RecordingsFolder
@@ -230,6 +231,41 @@ def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
         sink.close()
         eventually(lambda: failures.parts[0].working, what="it works again")
     assert [one.file for one in look(tmp_path)] == NAMES
+
+
+def test_a_disk_that_is_unmounted_and_comes_back_has_its_index(copied):
+    """All its files were forgotten while another folder was in its place, which was then taken for it."""
+    away = copied.with_name("away")
+    with closing(IndexWriter(copied, Retention((Limit(seconds=86_400),)))) as writer:
+        copied.rename(away)
+        for there in (None, away):
+            if there:
+                copytree(there, copied, dirs_exist_ok=True)
+            else:
+                copied.mkdir()
+            with pytest.raises(sqlite3.OperationalError, match="was removed"):
+                writer.log(None)
+    assert [one.file for one in read_index(away)] == NAMES
+
+
+def test_a_ground_that_ends_while_it_reads_many_files_leaves_them_to_the_next(copied, monkeypatch):
+    """It said that what it had yet to write was lost; and live video waited for the reading of old files."""
+    (copied / INDEX).unlink()
+    read, failures = [], Failures(time.time_ns)
+
+    def described(path: Path) -> RecordingRow | None:
+        read.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+        index._stop.wait(60)  # noqa: SLF001 - until it ends
+        return files.described(path)
+
+    monkeypatch.setattr(folder, "described", described)
+    with RecordingsFolder(copied, ALL, failures=failures) as index:
+        index.begin()
+        eventually(lambda: read, what="it reads")
+    assert (len(read), failures.parts) == (1, ())
+    assert read[0] >= 10
+    monkeypatch.undo()
+    assert [one.file for one in look(copied)] == NAMES
 
 
 def test_by_age_and_by_bytes(copied, caplog):

@@ -106,6 +106,7 @@ NOBODY = "nobody listens on port {free} there: is the other side running?"
         (b"", f"tcp/{'a' * 64}:7447", f"'{'a' * 64}' is no name that a machine can have"),
         (b"", "tcp/base..example:7447", "'base..example' is no name that a machine can have"),
         (b"", "udp/127.0.0.1:7447", "cannot be seen from outside"),
+        (b"", "quic/127.0.0.1:7447", "QUIC needs a path that carries packets of 1280 bytes"),
     ],
 )
 def test_what_is_no_ground_is_said(
