@@ -51,7 +51,8 @@ _INBOX_MESSAGES = 64
 _JPEG_QUALITY_PCT = 95
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 
-_Answer = TypeVar("_Answer")
+_Answer = TypeVar("_Answer", Info, ControlAnswer)
+_Message = TypeVar("_Message")
 
 
 class RefusedError(UserError):
@@ -117,8 +118,8 @@ def _link_hint(session: zenoh.Session) -> str:
 class RemoteEdge:
     """One edge, at the other end of the link.
 
-    Every method raises `UserError` where it does not answer, or our own keys do not let us ask, and `RefusedError`
-    where it says no.
+    Every method raises `UserError` where it does not answer, two edges of its name do, or our own keys do not let us
+    ask, and `RefusedError` where it says no.
     """
 
     def __init__(self, session: zenoh.Session, edge: str, *, refusal: Callable[[str], str]) -> None:
@@ -128,10 +129,10 @@ class RemoteEdge:
         self._refusal = refusal
 
     def info(self) -> Info:
-        answer = self._query(Channel.INFO, b"")
-        if answer is None:
+        info = self._query(Channel.INFO, b"", Info.parse)
+        if info is None:
             raise UserError(self._absent())
-        return self._parsed(Info.parse, answer)
+        return info
 
     def tracks(self, *, on_note: Callable[[str], None] = lambda _note: None) -> list[EdgeTrack]:
         """Its present tracks, by its own ids; ``on_note`` is called with a sentence if that is not all."""
@@ -209,7 +210,7 @@ class RemoteEdge:
         self._check_may_command()
         answer = self._commanded(command, arguments or {})
         if answer is None:
-            present = self._query(Channel.INFO, b"") is not None
+            present = self._query(Channel.INFO, b"", Info.parse) is not None
             why = control_unanswered(self._session, self.name, who="this key") if present else self._absent()
             raise UserError(why)
         return answer
@@ -268,11 +269,8 @@ class RemoteEdge:
             question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
         except ValueError as error:
             raise UserError(f"{command}: {error}") from None
-        data = self._query(Channel.CONTROL, question)
-        if data is None:
-            return None
-        answer = self._parsed(ControlAnswer.parse, data)
-        if not answer.accepted:
+        answer = self._query(Channel.CONTROL, question, ControlAnswer.parse)
+        if answer is not None and not answer.accepted:
             raise RefusedError(f"{self.name} refuses: {answer.reason}")
         return answer
 
@@ -280,11 +278,18 @@ class RemoteEdge:
         if refusal := self._refusal(self.name):
             raise UserError(refusal)
 
-    def _query(self, row: Channel, question: bytes) -> bytes | None:
+    def _query(self, row: Channel, question: bytes, parse: Callable[[bytes], _Answer]) -> _Answer | None:
         try:
-            return query(self._session, row, keys=self._keys, question=question, timeout_s=ANSWER_S)
+            answers = query(self._session, row, keys=self._keys, question=question, timeout_s=ANSWER_S)
         except zenoh.ZError:
             return None
+        of = {answer.session_id: answer for answer in (self._parsed(parse, data) for data in answers)}
+        if len(of) > 1:  # whichever answered first may be the one that the ground does not show
+            raise UserError(
+                f"two edges call themselves {self.name}, and both have answered: stop one of them, or start it with "
+                "an --edge-id of its own"
+            )
+        return next(iter(of.values()), None)
 
     def _absent(self) -> str:
         return (
@@ -348,7 +353,7 @@ class EdgeClient:
         self.close()
 
 
-def _read(parse: Callable[..., _Answer], *data: bytes) -> _Answer | None:
+def _read(parse: Callable[..., _Message], *data: bytes) -> _Message | None:
     try:
         return parse(*data)
     except WireError:

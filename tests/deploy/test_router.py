@@ -77,7 +77,7 @@ def test_messages_questions_and_presence_pass(receiver: str) -> None:
         assert sample.attachment is not None
         assert sample.attachment.to_bytes() == b"header"
         assert sample.timestamp is None, "a router that stamps adds 26 bytes to each message"
-        assert query(other, Channel.INFO, keys=KEYS, question=b"this", timeout_s=60) == b"answer to this"
+        assert query(other, Channel.INFO, keys=KEYS, question=b"this", timeout_s=60) == [b"answer to this"]
         alive = [reply.ok.key_expr for reply in other.liveliness().get("hvt/*/alive") if reply.ok is not None]
         assert [str(key) for key in alive] == ["hvt/uav-1/alive"]
         token.undeclare()

@@ -74,7 +74,8 @@ class _Ground:
 
         def asked() -> bool:
             found = [
-                query(self.session, row, keys=EdgeKeys(edge), question=b"", timeout_s=2) for edge in EDGES
+                b"".join(query(self.session, row, keys=EdgeKeys(edge), question=b"", timeout_s=2)) or None
+                for edge in EDGES
             ]
             assert not any(one for one, wanted in zip(found, expected, strict=True) if wanted is None), found
             return found == list(expected)

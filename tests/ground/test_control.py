@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -21,7 +23,7 @@ from hvt_fleet.commands import run
 from hvt_ground import control
 from hvt_ground.cli import main
 from hvt_ground.control import EdgeClient, RefusedError, RemoteEdge, RequestedStill
-from programs.processes import PATIENT_S
+from programs.processes import PATIENT_S, eventually
 from rigs import messages
 
 KEYS = EdgeKeys("uav-1")
@@ -143,6 +145,27 @@ def test_refusals_are_the_edges_own_words(edge, uav):
     for ask in (lambda: uav.still(track=9), lambda: uav.set_budget(5)):
         with pytest.raises(RefusedError, match="uav-1 refuses: there is no track 9 at frame 4"):
             ask()
+
+
+def test_where_two_edges_have_one_name_neither_is_taken_for_the_other(edge, uav):
+    """The still was of whichever answered first, its tracks had the classes of the other, and both were commanded."""
+
+    def refused(request: Callable[[], object]) -> bool:
+        with suppress(UserError):
+            request()
+            return False
+        return True
+
+    with open_session(LinkSettings("edge", connect=(edge.endpoint,))) as other:
+        serve(other, Channel.CONTROL, keys=KEYS, answer=lambda _: replace(YES, session_id=8).pack())
+        serve(other, Channel.INFO, keys=KEYS, answer=lambda _: replace(INFO, session_id=8).pack())
+        eventually(lambda: refused(uav.info), what="the other is known")
+        for request in (uav.info, uav.still, uav.tracks, partial(uav.set_budget, 5)):
+            with pytest.raises(
+                UserError, match="two edges call themselves uav-1, and both have answered: stop one"
+            ):
+                request()
+    assert [one.command for one in edge.asked] == ["set-budget"]
 
 
 def test_a_still_that_was_given_up_is_not_waited_for(edge, uav):

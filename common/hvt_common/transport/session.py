@@ -157,11 +157,11 @@ def subscribe(
 
 def query(
     session: zenoh.Session, channel: Channel, *, keys: EdgeKeys, question: bytes, timeout_s: float
-) -> bytes | None:
-    """The first answer of a queryable channel; None when there is none in time, after ``timeout_s``.
+) -> list[bytes]:
+    """The answers of a queryable channel; none when there is none in time, after ``timeout_s``.
 
-    Over UDP a question or its answer may be lost: after half of the time it is asked once more, so it must be a
-    question that is safe to ask twice.
+    There are several where several edges have one name. Over UDP a question or its answer may be lost: after half of
+    the time it is asked once more, so it must be a question that is safe to ask twice.
     """
     found: SimpleQueue[bytes | None] = SimpleQueue()
 
@@ -176,11 +176,17 @@ def query(
             on_end=lambda: found.put(None),
         )
 
+    answers: list[bytes] = []
     ask(timeout_s)
+    until_s = time.monotonic() + timeout_s / 2
     with suppress(Empty):
-        return found.get(timeout=timeout_s / 2)
-    ask(timeout_s / 2)
-    return found.get() or found.get()
+        while answer := found.get(timeout=max(0.0, until_s - time.monotonic())):
+            answers.append(answer)
+        return answers
+    if not answers:
+        ask(timeout_s / 2)
+        answers += filter(None, [found.get() or found.get()])
+    return answers
 
 
 def query_later(

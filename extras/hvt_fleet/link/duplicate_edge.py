@@ -87,7 +87,7 @@ def _info(config: zenoh.Config, keys: EdgeKeys, *, answer_s: float) -> Info | No
             tokens = session.liveliness().get(keys[Channel.ALIVE], timeout=answer_s)
             if not any(reply.ok is not None for reply in tokens):
                 return None
-            answer = query(session, Channel.INFO, keys=keys, question=b"", timeout_s=answer_s)
-            return None if answer is None else Info.parse(answer, versions=READ_VERSIONS)
+            answers = query(session, Channel.INFO, keys=keys, question=b"", timeout_s=answer_s)
+            return Info.parse(answers[0], versions=READ_VERSIONS) if answers else None
     except (zenoh.ZError, WireError):
         return None

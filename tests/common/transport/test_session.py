@@ -97,10 +97,10 @@ def test_questions_are_answered_and_silence_ends(endpoint):
         answers = {b"size?": b"1280x720"}
         queryable = serve(connector, Channel.INFO, keys=KEYS, answer=answers.get)
         eventually(
-            lambda: query(listener, Channel.INFO, keys=KEYS, question=b"size?", timeout_s=1) == b"1280x720"
+            lambda: query(listener, Channel.INFO, keys=KEYS, question=b"size?", timeout_s=1) == [b"1280x720"]
         )
-        assert query(listener, Channel.INFO, keys=KEYS, question=b"other?", timeout_s=1) is None
-        assert query(listener, Channel.CONTROL, keys=KEYS, question=b"size?", timeout_s=1) is None
+        assert query(listener, Channel.INFO, keys=KEYS, question=b"other?", timeout_s=1) == []
+        assert query(listener, Channel.CONTROL, keys=KEYS, question=b"size?", timeout_s=1) == []
         queryable.undeclare()
 
 
@@ -243,7 +243,7 @@ def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
                 publisher.put(str(row).encode())
             came = {inbox.get(timeout_s=60).payload.decode() for _ in rows}
             assert came == {str(row) for row in rows}
-            assert query(listener, Channel.INFO, keys=KEYS, question=b"who?", timeout_s=5) == b"who?"
+            assert query(listener, Channel.INFO, keys=KEYS, question=b"who?", timeout_s=5) == [b"who?"]
             queryable.undeclare()
         subscriber.undeclare()
 
@@ -490,10 +490,10 @@ def test_a_question_that_is_lost_is_asked_once_more(monkeypatch):
 
     monkeypatch.setattr("hvt_common.transport.session.query_later", later)
     told: dict[str, Any] = {"keys": EdgeKeys("uav-1"), "question": b"", "timeout_s": 0.02}
-    assert query(None, Channel.CONTROL, **told) == b"yes"
+    assert query(None, Channel.CONTROL, **told) == [b"yes"]
     assert asked_s == [0.02, 0.01]
     there = False
-    assert query(None, Channel.CONTROL, **told) is None
+    assert query(None, Channel.CONTROL, **told) == []
     assert len(asked_s) == 3, "nobody is there: who waits is told at once"
 
 

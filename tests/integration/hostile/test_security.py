@@ -155,7 +155,7 @@ def test_an_edge_cannot_write_as_another(
             forger.put(UAV2[row], b"forged")
         own.put(b"own")
         eventually(lambda: came, what="the edge's own message")
-        assert query(ground, Channel.INFO, keys=UAV2, question=b"", timeout_s=1) is None
+        assert query(ground, Channel.INFO, keys=UAV2, question=b"", timeout_s=1) == []
         eventually(lambda: "'uav-1' is linked" in caplog.text, what="the ground is told")
         assert came == [UAV1[Channel.STATUS]]
     assert "or it runs under another id than its certificate says, and all it sends is dropped" in caplog.text
@@ -188,7 +188,7 @@ def test_watching_commanding_and_being_a_stranger(
         def answers(row: Channel, expected: dict[str, bytes | None]) -> bool:
             """Who may ask is answered, on a busy machine at another try; who may not, at none."""
             found = {
-                name: query(ground, row, keys=UAV1, question=b"do", timeout_s=2)
+                name: b"".join(query(ground, row, keys=UAV1, question=b"do", timeout_s=2)) or None
                 for name, ground in grounds.items()
             }
             assert not any(found[name] for name, answer in expected.items() if answer is None), found
