@@ -95,7 +95,7 @@ class Index:
         """
         if (
             not self._is_there()
-        ):  # all its files would seem to be gone, and what is noted would be in no folder
+        ):  # all its files would seem to be gone, and a row would be in no folder
             raise sqlite3.OperationalError(f"{self._path} was removed")
         with self._database as transaction:
             transaction.execute("BEGIN IMMEDIATE")
