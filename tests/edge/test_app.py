@@ -1,7 +1,5 @@
 """An edge whole, with real x265 and Zenoh, on a source that no command line has."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time
@@ -188,7 +186,7 @@ class FragileDetector(Detector):
 
     class_names = ("car",)
 
-    def __init__(self, first: weakref.ref[FragileDetector] | None, stop: threading.Event) -> None:
+    def __init__(self, first: "weakref.ref[FragileDetector] | None", stop: threading.Event) -> None:
         self.first, self.runs, self._stop = first, 0, stop
         self.alone: bool | None = None
 

@@ -1,7 +1,5 @@
 """Every setting of hvt-edge."""
 
-from __future__ import annotations
-
 import dataclasses
 import pwd
 import re

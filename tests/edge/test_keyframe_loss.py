@@ -1,7 +1,5 @@
 """Keyframes on a link that loses messages: the edge's plan, the ground's reassembler, a round trip between."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What holds in flight; when a keyframe comes, and who may request one."""
 
-from __future__ import annotations
-
 import threading
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """What the program says of an address that it cannot use, however it was mistyped."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

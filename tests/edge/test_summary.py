@@ -1,7 +1,5 @@
 """What an edge says of a run at its end."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The ground flies the same without its extras, and names the one that is missing."""
 
-from __future__ import annotations
-
 import re
 import time
 from importlib.metadata import EntryPoint

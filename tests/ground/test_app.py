@@ -1,7 +1,5 @@
 """One run of a ground: when it ends by itself, and what it says where it cannot go on."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

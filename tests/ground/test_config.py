@@ -1,7 +1,5 @@
 """Every setting of hvt-ground, and the names of its recordings."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """Asking from the ground, against a scripted edge on a real link: what is believed, what is said, what is written."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress

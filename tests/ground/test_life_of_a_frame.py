@@ -1,7 +1,5 @@
 """One access unit from the link to the list of tracks, through real parts: how many files it walks through."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """Networks that take long to load: a ground receives, records and shows video meanwhile."""
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import nullcontext

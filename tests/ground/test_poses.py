@@ -1,7 +1,5 @@
 """The pose of a moment."""
 
-from __future__ import annotations
-
 import pytest
 
 from hvt_common.values import Orientation, Pose

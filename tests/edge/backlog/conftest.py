@@ -1,7 +1,5 @@
 """A store, and a disk of one megabyte."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

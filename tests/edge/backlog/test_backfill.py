@@ -1,7 +1,5 @@
 """What was kept comes back in pieces, until a ground has it: a real store, a real assembly, a link that loses."""
 
-from __future__ import annotations
-
 import logging
 import random
 from collections import Counter

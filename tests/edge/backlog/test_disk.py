@@ -1,7 +1,5 @@
 """What the edge keeps while its link is away: real files, real access units, kills and full disks."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

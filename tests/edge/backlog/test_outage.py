@@ -1,7 +1,5 @@
 """When the link is away, and which frames it took with it."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 

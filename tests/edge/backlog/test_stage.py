@@ -1,7 +1,5 @@
 """Between the link and the store: real frames, a real encoder, a real folder, a link that goes and comes."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

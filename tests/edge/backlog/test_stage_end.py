@@ -1,7 +1,5 @@
 """How the edge leaves a link and comes back to it, and how a run ends: nothing that was admitted may be lost."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

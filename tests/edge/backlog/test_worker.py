@@ -1,7 +1,5 @@
 """The threads behind the store: a disk that hangs, a link that is full, a folder that vanishes."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import sqlite3

@@ -1,7 +1,5 @@
 """What an edge does when it is asked for more, with its real parts and a real budget."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """What reports of grounds decide, and what happens without any."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Live video comes back: budgets, frame rates, silences and falls of the link, with all that shares the window."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

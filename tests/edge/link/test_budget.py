@@ -1,7 +1,5 @@
 """The hard budget, against brute force over every rolling window."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What grounds report, and when the edge takes it in."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 

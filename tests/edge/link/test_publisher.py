@@ -1,7 +1,5 @@
 """What an edge answers, without a link."""
 
-from __future__ import annotations
-
 import socket
 import time
 import zlib

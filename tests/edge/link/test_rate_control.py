@@ -1,7 +1,5 @@
 """The rate follows the link: a bottleneck with a queue, simulated, and what the edge would have sent into it."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -73,7 +71,7 @@ class World:
         self.news, self.keyframe, self.tokens = False, True, 0.0
         self.window: list[tuple[int, int]] = []
 
-    def run(self, seconds: float) -> World:
+    def run(self, seconds: float):
         until_ns = self.now_ns + round(seconds * S)
         while self.now_ns < until_ns:
             self._step()

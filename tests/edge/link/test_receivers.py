@@ -1,7 +1,5 @@
 """Which ground's reports count."""
 
-from __future__ import annotations
-
 import random
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Which codecs of stills all grounds read."""
 
-from __future__ import annotations
-
 import logging
 
 from hvt_common.protocol.messages import InfoRequest

@@ -1,7 +1,5 @@
 """The edge's end of the tracks channel."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hvt_common.protocol.messages import TrackStep, TrackStepDecoder

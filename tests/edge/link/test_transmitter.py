@@ -1,7 +1,5 @@
 """The place where bytes leave the edge: headers, ledger and budget."""
 
-from __future__ import annotations
-
 import random
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The frame loop, the stills and the backlog send at one time: the budget holds whoever comes first."""
 
-from __future__ import annotations
-
 import random
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What became of each source frame, and the processor time that all would take."""
 
-from __future__ import annotations
-
 import math
 import os
 import threading

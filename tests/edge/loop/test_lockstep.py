@@ -1,7 +1,5 @@
 """The frame loop in lockstep where not every frame is coded."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

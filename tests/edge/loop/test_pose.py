@@ -1,7 +1,5 @@
 """When a pose is told to the ground."""
 
-from __future__ import annotations
-
 import pytest
 
 from hvt_common.protocol.messages import PoseDecoder, PoseReport

@@ -1,7 +1,5 @@
 """The frame loop in real time: video goes on whatever happens behind it."""
 
-from __future__ import annotations
-
 import threading
 import weakref
 from dataclasses import replace

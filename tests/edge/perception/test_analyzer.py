@@ -1,7 +1,5 @@
 """What the edge sees of its own stream, and the thread it sees in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 

@@ -1,7 +1,5 @@
 """What is sent beside the video, by what it was measured to give."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """What a candidate knows of its place in the picture, and of what the base lost."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

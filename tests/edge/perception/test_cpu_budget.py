@@ -1,7 +1,5 @@
 """Perception gives way to video, and among its parts the later ones to those before."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -51,7 +49,7 @@ class Rig:
         self.index = self.lost = 0
         self.followed, self.looked, self.compared = list[int](), list[int](), list[int]()
 
-    def fly(self, seconds: float, *, loses=lambda _index: False, late: bool = False) -> Rig:
+    def fly(self, seconds: float, *, loses=lambda _index: False, late: bool = False):
         for _ in range(round(seconds * FPS)):
             self._frame(loses, late=late)
             self.index += 1

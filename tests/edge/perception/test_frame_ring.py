@@ -1,7 +1,5 @@
 """The ring of source frames: what it keeps, and how far back it goes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

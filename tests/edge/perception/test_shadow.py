@@ -1,7 +1,5 @@
 """How much of what the source shows the ground would miss."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The once-a-second report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

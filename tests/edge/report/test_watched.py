@@ -1,7 +1,5 @@
 """An edge that is watched: what Prometheus, a probe and systemd learn while it flies, waits and hangs."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

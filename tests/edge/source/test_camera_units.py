@@ -1,7 +1,5 @@
 """A camera's packets as access units: real containers, and whatever a broken file or a stranger may send."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import av

@@ -1,7 +1,5 @@
 """Sources whose frames come with the camera's own units: real files, and a real RTSP camera."""
 
-from __future__ import annotations
-
 import time
 from functools import partial
 from itertools import count, pairwise

@@ -1,7 +1,5 @@
 """A live camera: what its frames' times mean, and what happens when it goes away."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

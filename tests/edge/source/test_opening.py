@@ -1,7 +1,5 @@
 """Every kind of source, on real files and real sockets."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import io

@@ -1,7 +1,5 @@
 """Resampling in time and space."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An RTSP camera of another make, GStreamer's server, that dies or hangs in flight and is started again."""
 
-from __future__ import annotations
-
 import time
 from contextlib import ExitStack
 from itertools import pairwise

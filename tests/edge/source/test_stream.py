@@ -1,7 +1,5 @@
 """A network stream that goes on without its picture."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import socket

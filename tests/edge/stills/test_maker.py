@@ -1,7 +1,5 @@
 """The still stage: fits its admission, shows the box, and beats the base."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Neighbours that share a still: never more bytes, nobody lost, the same every time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole life of a still: pending, sent, acknowledged, lost, stored, expired."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 

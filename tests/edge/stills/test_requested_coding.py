@@ -1,7 +1,5 @@
 """A closer look is closer than the video: how a requested crop is coded, and what it takes of the video."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from dataclasses import replace

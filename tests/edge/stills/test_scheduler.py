@@ -1,7 +1,5 @@
 """From tracks to stills, with the real codec; every request has one outcome."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

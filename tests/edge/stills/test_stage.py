@@ -1,7 +1,5 @@
 """One frame of the side channel after the other: tracks, stills, and what the ground says of them."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """Stills in an outage: chosen as ever, coded without the base, kept instead of sent; and video that is asked for."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import cv2

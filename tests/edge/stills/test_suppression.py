@@ -1,7 +1,5 @@
 """Temporal suppression and the memory that feeds it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

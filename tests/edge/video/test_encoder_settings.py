@@ -1,7 +1,5 @@
 """What is asked of x265, and what it then puts on the line."""
 
-from __future__ import annotations
-
 import pytest
 
 from hvt_common.protocol.channels import Channel, EdgeKeys

@@ -1,7 +1,5 @@
 """A camera's own units through the stage: real HEVC, real budget, real store; nothing follows what is missing."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from itertools import accumulate, pairwise, product

@@ -1,7 +1,5 @@
 """A camera's own units over a link that goes, thins out and comes back: the real pacer, rates and budget."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether an encoder keeps to its rate, measured before the flight: real x265 that is asked for too much."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from typing import Any

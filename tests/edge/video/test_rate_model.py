@@ -1,7 +1,5 @@
 """From a rate, a quantiser and processor time to size, frame rate and preset of the base stream."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Encoders that other packages install: found by name, checked, refused in a sentence."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

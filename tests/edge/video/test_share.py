@@ -1,7 +1,5 @@
 """``--video-share auto``: the split follows the scene, at keyframes, and does not waver."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """One frame of the base stream after the other: real encoder, real budget, real file."""
 
-from __future__ import annotations
-
 import sys
 import time
 import weakref

@@ -1,7 +1,5 @@
 """The base stream, out of the real x265."""
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

@@ -1,7 +1,5 @@
 """``--profile auto`` looks at the first second of a scene before it flies: real x265, the embedded detector."""
 
-from __future__ import annotations
-
 import threading
 import time
 from itertools import count

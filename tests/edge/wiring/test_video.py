@@ -1,7 +1,5 @@
 """The size and frame rate of the base stream where nobody gives them, and a camera that is passed through."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Recordings beside each other in one file."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

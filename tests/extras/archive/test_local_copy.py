@@ -1,7 +1,5 @@
 """The Matroska file of the base stream."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

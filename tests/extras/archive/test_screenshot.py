@@ -1,7 +1,5 @@
 """A picture of the finished screen, taken without a screen."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """WebP, AVIF and JPEG XL: files of other kinds are refused, and other programs open ours."""
 
-from __future__ import annotations
-
 import io
 
 import cv2

@@ -1,7 +1,5 @@
 """Checks before a flight."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

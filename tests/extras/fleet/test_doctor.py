@@ -1,7 +1,5 @@
 """``hvt-edge doctor`` and ``hvt-ground doctor``: before the flight, not in it."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import socket

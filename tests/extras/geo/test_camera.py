@@ -1,7 +1,5 @@
 """From picture to ground, against geometry by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Places against the drawn scene, whose camera and objects are known exactly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

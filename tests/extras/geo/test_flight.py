@@ -1,7 +1,5 @@
 """A flight with a pose: budget, map and places as the drawn scene has them."""
 
-from __future__ import annotations
-
 import csv
 
 import numpy as np

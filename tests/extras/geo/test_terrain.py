@@ -1,7 +1,5 @@
 """Places on ground that is not flat, from real GeoTIFFs."""
 
-from __future__ import annotations
-
 import logging
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Stills in their places on the base picture."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

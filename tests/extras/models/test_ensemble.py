@@ -1,7 +1,5 @@
 """Several detectors as one: what their boxes become, and which names of several are accepted."""
 
-from __future__ import annotations
-
 import shutil
 from functools import partial
 from pathlib import Path

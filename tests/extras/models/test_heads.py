@@ -1,7 +1,5 @@
 """Every head that the field uses: what it is taken for, and that its boxes come out where they are."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

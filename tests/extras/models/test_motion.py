@@ -1,7 +1,5 @@
 """The detector without weights: patches that move over real and drawn ground, under a camera that moves too."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Models by name: fetched from a real HTTP server on loopback, brought by hand, checked before use."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """Who may open the page: tokens that several grounds of one machine share."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 

@@ -1,7 +1,5 @@
 """The rungs of the live picture, from a real base stream."""
 
-from __future__ import annotations
-
 import io
 import struct
 from dataclasses import replace

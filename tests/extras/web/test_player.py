@@ -1,7 +1,5 @@
 """The player knows which picture is on the screen, as long as the browser can show it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

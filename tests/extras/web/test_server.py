@@ -1,7 +1,5 @@
 """The page's server: who may come in, and what nobody can break from outside."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import math

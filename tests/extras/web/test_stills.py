@@ -1,7 +1,5 @@
 """The list of stills shows which objects each line is about."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Viewers of one edge: newcomers begin in the middle, slow ones lose pictures, nobody waits for another."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import threading

@@ -1,7 +1,5 @@
 """What the page says of the picture: every sentence, as the page's own code makes it."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

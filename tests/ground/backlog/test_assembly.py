@@ -1,7 +1,5 @@
 """What an edge kept while its link was away: put together again, bounded, acknowledged, each once."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

@@ -1,7 +1,5 @@
 """Jobs of the backlog: what they log is acknowledged when it is written; what a session's end overtakes is let go."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import threading

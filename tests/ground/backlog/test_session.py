@@ -1,7 +1,5 @@
 """A hole in a flight is filled: real access units and stills that were kept, into real recordings, read back."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import threading

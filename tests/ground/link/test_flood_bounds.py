@@ -1,7 +1,5 @@
 """A session that is flooded with valid messages: what it keeps, and that it finds its way back to the real ones."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The base stream through loss, repetition, reordering, restarts and forged numbers."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

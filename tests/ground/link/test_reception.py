@@ -1,7 +1,5 @@
 """What the receiver measures for the edge's rate."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 

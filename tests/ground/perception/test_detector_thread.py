@@ -1,7 +1,5 @@
 """Sessions that share a detector get it alike, and one at a time."""
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

@@ -1,7 +1,5 @@
 """What stands there and is hardly believed has no name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

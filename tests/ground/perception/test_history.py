@@ -1,7 +1,5 @@
 """The last seconds of pictures and tracks: found by frame, bounded, and never mixed up."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

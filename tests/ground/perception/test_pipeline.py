@@ -1,7 +1,5 @@
 """What the ground sees on real decoded pictures, and what stills change."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 
@@ -61,7 +59,7 @@ class Rig:
         self.reader = options.pop("reader", SameAnswer())
         self.pipeline: Pipeline = pipeline_of(self.events.append, reader=self.reader, **options)
 
-    def look(self, pictures) -> Rig:
+    def look(self, pictures):
         """Analyze them in turn."""
         for picture in pictures:
             self.pipeline.analyze(picture, hurry=False)

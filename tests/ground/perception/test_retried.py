@@ -1,7 +1,5 @@
 """A model whose run raises: the ground goes on without boxes or names, says so once, and opens it again."""
 
-from __future__ import annotations
-
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

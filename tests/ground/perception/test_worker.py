@@ -1,7 +1,5 @@
 """The order in which perception takes what has come, in real time."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

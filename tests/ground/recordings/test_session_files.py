@@ -1,7 +1,5 @@
 """A session in several files: nothing lost between them, and each opens by itself."""
 
-from __future__ import annotations
-
 import subprocess
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A ground that is watched: what Prometheus, a probe and a second shell read while it serves a real edge."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

@@ -1,7 +1,5 @@
 """What a ground says of its sessions while they fly and when they have ended."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

@@ -1,7 +1,5 @@
 """An edge that is started again and again, as a supervisor does with one that crashes: its ground stays as it is."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

@@ -1,7 +1,5 @@
 """What goes wrong in one session ends that session, with its recording whole; another begins, others go on."""
 
-from __future__ import annotations
-
 import logging
 import sys
 import time

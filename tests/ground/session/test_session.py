@@ -1,7 +1,5 @@
 """Messages of an edge in, sessions out: real access units through the real threads."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Which edges a ground serves where more names come than it takes; how it talks to them, and hands over errors."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

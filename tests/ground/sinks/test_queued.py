@@ -1,7 +1,5 @@
 """Sinks that are slow, gone or dead: whoever logs is not held up, and what is missing is known."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """Clips as cameras, recorders and phones leave them, against what a player shows."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import shutil

@@ -1,7 +1,5 @@
 """Clips that change in their midst: recordings put together, frames that a recorder dropped, a film turned."""
 
-from __future__ import annotations
-
 import os
 import re
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Times of frames as a player gives them."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """M6: the expected gain a byte, term by term."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import exp
 

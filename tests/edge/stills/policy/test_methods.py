@@ -1,7 +1,5 @@
 """The scheduling policies: what each wants, and that each is a pure function."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, replace
 from math import exp
 

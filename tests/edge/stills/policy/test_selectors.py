@@ -1,7 +1,5 @@
 """The pilot's four selectors, against a second implementation that follows the published table row by row."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``hvt-ground export``: each kind opens in the program that it is for, and says what the ground knew."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """Exports for maps: they open elsewhere, and say where things were."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

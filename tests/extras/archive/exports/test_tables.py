@@ -1,7 +1,5 @@
 """The tables of tracks and stills, for people and programs that come after."""
 
-from __future__ import annotations
-
 import csv
 import errno
 from contextlib import closing

@@ -1,7 +1,5 @@
 """The table of ``--timing``: what a user reads the latency of each message from."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 import signal

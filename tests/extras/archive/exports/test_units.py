@@ -1,7 +1,5 @@
 """Each export writes frame, box and confidence as the table of docs/export.md shows them."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ET

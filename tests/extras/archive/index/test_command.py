@@ -1,7 +1,5 @@
 """``hvt-ground recordings``: the flight with the truck is found, and what cannot be is said in one sentence."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

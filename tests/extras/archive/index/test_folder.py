@@ -1,7 +1,5 @@
 """The index of a folder of recordings: it survives kills and damage, disturbs no flight, removes what it should."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sqlite3

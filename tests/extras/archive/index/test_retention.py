@@ -1,7 +1,5 @@
 """What is due to go, and what never is."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

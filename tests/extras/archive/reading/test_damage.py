@@ -1,7 +1,5 @@
 """What is read of recordings that are damaged, and of those that only seem to be."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """What of a recording can be read: the SDK is asked as seldom as may be, for it may never answer."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A recording that is read back: as long as it may be, what is in memory stays small."""
 
-from __future__ import annotations
-
 import errno
 import gc
 import os

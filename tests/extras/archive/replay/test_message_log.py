@@ -1,7 +1,5 @@
 """The log of messages: what was written is read back, whatever happened to the file."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """``hvt-ground --log`` and ``replay``: a flight is received again, the same or with other models."""
 
-from __future__ import annotations
-
 import csv
 import json
 import time

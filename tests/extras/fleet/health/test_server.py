@@ -1,7 +1,5 @@
 """Who watches a program: nobody else's page reads along."""
 
-from __future__ import annotations
-
 import errno
 import http.client
 import json

@@ -1,7 +1,5 @@
 """Why there is no link, in words: probes of real listeners, keys read before the start, rights read from the file."""
 
-from __future__ import annotations
-
 import datetime as dt
 import logging
 import os

@@ -1,7 +1,5 @@
 """Whether another edge of the same id lives on the link."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

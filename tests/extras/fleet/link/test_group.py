@@ -1,7 +1,5 @@
 """Who of a group serves which edge."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from unittest.mock import MagicMock

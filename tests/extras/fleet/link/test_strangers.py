@@ -1,7 +1,5 @@
 """Who knocks and is refused is named, once a minute; who has a link is not."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import socket

@@ -1,7 +1,5 @@
 """``hvt-ground keys``: what it writes, whom it lets do what, and what it refuses."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Cursor on Target over real sockets: datagrams, streams, certificates, and servers that are bad or gone."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 import socket

@@ -1,7 +1,5 @@
 """The XML of an event, read by a parser that knows nothing of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from xml.etree import ElementTree as ET
 

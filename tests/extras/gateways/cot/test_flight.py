@@ -1,7 +1,5 @@
 """A flight of the drawn scene, edge to ground, as somebody on the network sees it."""
 
-from __future__ import annotations
-
 import datetime as dt
 from collections import defaultdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What of a session is reported, as what, and when."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """When a track is reported, and what motion it has."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

@@ -1,7 +1,5 @@
 """The MCAP file of a ground that never came to close it."""
 
-from __future__ import annotations
-
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path

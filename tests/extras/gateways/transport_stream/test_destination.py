@@ -1,7 +1,5 @@
 """Where a transport stream may go, and what is refused before the flight."""
 
-from __future__ import annotations
-
 import errno
 import socket
 from pathlib import Path

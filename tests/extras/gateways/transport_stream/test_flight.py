@@ -1,7 +1,5 @@
 """A flight of the drawn scene with ``--ts``: all that other sinks have is in the stream."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import pytest

@@ -1,7 +1,5 @@
 """When metadata is said, and at which time of the stream."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The stream as players and KLV readers have it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket

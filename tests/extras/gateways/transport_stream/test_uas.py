@@ -1,7 +1,5 @@
 """What a moment is said to be: read back by klvdata, to the step of each item."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

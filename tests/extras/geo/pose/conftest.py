@@ -1,7 +1,5 @@
 """An autopilot that sends over real sockets."""
 
-from __future__ import annotations
-
 import math
 import socket
 import time

@@ -1,7 +1,5 @@
 """Poses from files as people have them, and what is said of those that cannot be read."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Poses from an autopilot, over a real socket."""
 
-from __future__ import annotations
-
 import math
 import random
 import socket

@@ -1,7 +1,5 @@
 """Who speaks MAVLink on one port: autopilots, gimbals, serial bridges, vehicles that come and go."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

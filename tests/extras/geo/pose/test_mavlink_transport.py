@@ -1,7 +1,5 @@
 """An autopilot behind a TCP server or a serial device, which come and go."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

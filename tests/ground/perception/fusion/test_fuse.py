@@ -1,7 +1,5 @@
 """One list from our own tracks, the edge's and the stills: each object once, under one id, where it is."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from unittest import mock
 

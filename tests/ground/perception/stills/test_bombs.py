@@ -4,8 +4,6 @@ Each bomb is decoded in a process of its own, which says by how much its peak of
 a bomb that went off would take hundreds of megabytes.
 """
 
-from __future__ import annotations
-
 import io
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """How stills are named: on the crop alone, or on the picture with the crops pasted in."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import av

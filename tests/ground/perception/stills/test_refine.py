@@ -1,7 +1,5 @@
 """Stills find their own track, at their own frame, and say what it is."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

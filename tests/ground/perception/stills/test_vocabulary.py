@@ -1,7 +1,5 @@
 """A classifier of other words says what its words mean for a track, or nothing."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Words on the picture are readable: beside their own object, over no other, and only where there is a reason."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

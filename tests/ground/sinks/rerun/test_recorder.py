@@ -1,7 +1,5 @@
 """The recording: whole at every moment, small, and telling what was logged."""
 
-from __future__ import annotations
-
 import errno
 import os
 import socket

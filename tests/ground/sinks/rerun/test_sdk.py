@@ -1,7 +1,5 @@
 """A recording that is closed leaves nothing behind in the process."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

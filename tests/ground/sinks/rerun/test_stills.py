@@ -1,7 +1,5 @@
 """Stills and origins in the recording: where a still is shown, for how long, and who knows of a track."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
