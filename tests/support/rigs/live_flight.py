@@ -38,7 +38,6 @@ from rigs.kept import INFO
 from rigs.messages import feedback
 from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
 
-_WAY_NS = SECOND_NS // 50
 _REPORT_NS, _IDLE_REPORT_NS = SECOND_NS // 8, SECOND_NS // 2
 _PIXELS = np.zeros((8, 8, 3), np.uint8)
 _START_NS = 1_790_000_000 * SECOND_NS
@@ -130,8 +129,9 @@ class _Ground:
 class LiveFlight:
     """One flight. Seconds count from its first frame.
 
-    ``late_s(second)`` is how much later a report comes that is made then, None: not at all. ``joins_s`` is when the
-    ground comes. ``commands`` are ``(second, budget)``. ``store`` is a folder for what is stored while the link is
+    ``late_s(second)`` is how much later a report comes that is made then, None: not at all. ``way_s(second)`` is how
+    long a message is under way, ``ahead_s(second)`` how far ahead the ground's clock. ``joins_s`` is when the ground
+    comes. ``commands`` are ``(second, budget)``. ``store`` is a folder for what is stored while the link is
     away. To code a frame takes about ``coding_s``, a keyframe ``keyframe_times`` as long. The real x265 codes
     ``pictures``, one after the other, for ever.
     """
@@ -141,6 +141,8 @@ class LiveFlight:
         link: SteppedLink,
         *,
         late_s: Callable[[float], float | None] = lambda _second: 0.0,
+        way_s: Callable[[float], float] = lambda _second: 0.02,
+        ahead_s: Callable[[float], float] = lambda _second: 0.0,
         joins_s: float = 0.0,
         commands: Sequence[tuple[float, int]] = (),
         store: Path | None = None,
@@ -160,6 +162,7 @@ class LiveFlight:
         assert size is not None, "given"
         check_rate(config, size)
         self.link, self.loss, self.late_s, self.joins_s = link, loss, late_s, joins_s
+        self.way_s, self.ahead_s = way_s, ahead_s
         self.commands, self.pictures = list(commands), pictures or [_PIXELS]
         self.coding_s, self.keyframe_times, self.held = coding_s, keyframe_times, 0
         self.track_bytes, self.pose_bytes = track_bytes, pose_bytes
@@ -169,8 +172,10 @@ class LiveFlight:
         self.sent: list[float] = []
         """Seconds at which an access unit went out."""
         self.rates: list[tuple[float, int]] = []
-        self._left: list[tuple[float, float]] = []
-        """(second at which a message was sent, second at which it had left)."""
+        self.opened: list[float] = []
+        """Seconds at which an encoder was opened."""
+        self._left: list[tuple[float, float, int]] = []
+        """(second at which a message was sent, second at which it had left, its bytes)."""
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=round(keyframe_s * SECOND_NS)))
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
@@ -244,11 +249,16 @@ class LiveFlight:
     def second(self) -> float:
         return (self.now_ns - _START_NS) / SECOND_NS
 
+    @property
+    def _way_ns(self) -> int:
+        return round(self.way_s(self.second) * SECOND_NS)
+
     def _clock(self) -> int:
         return self.now_ns
 
     def _opened(self, size: tuple[int, int], rates: Rates) -> Encoder:
         config = self.config
+        self.opened.append(self.second)
         if self.pictures[0] is not _PIXELS:
             return make_encoder(config, rates, size=size, preset="ultrafast")
         asked = encoder_settings(
@@ -272,14 +282,14 @@ class LiveFlight:
         size_bytes = len(payload) + len(attachment or b"") + 60
         left_ns = self.link.carry(size_bytes, at_ns=self.now_ns - _START_NS)
         if left_ns is not None:
-            self._left.append((self.second, left_ns / SECOND_NS))
+            self._left.append((self.second, left_ns / SECOND_NS, size_bytes))
         if channel is not Channel.BASE:
             return
         self.sent.append(self.second)
         if left_ns is None or self.chance.random() < self.loss:
             return
         header = BaseHeader.parse(attachment or b"", payload)
-        at_ns = _START_NS + left_ns + _WAY_NS
+        at_ns = _START_NS + left_ns + self._way_ns
         self._at(at_ns, lambda: self.ground.take(header, now_ns=at_ns - _START_NS))
 
     def _wait_until(self, at_ns: int) -> None:
@@ -374,7 +384,7 @@ class LiveFlight:
             session_id=1,
             receiver_id=1,
             sequence=ground.number,
-            send_ns=self.now_ns,
+            send_ns=self.now_ns + round(self.ahead_s(second) * SECOND_NS),
             base_messages=ground.messages,
             lost=ground.lost,
             base_sequence=ground.last,
@@ -386,7 +396,7 @@ class LiveFlight:
         late_s = self.late_s(second)
         if late_s is None:
             return
-        at_ns = self.now_ns + _WAY_NS + round(late_s * SECOND_NS)
+        at_ns = self.now_ns + self._way_ns + round(late_s * SECOND_NS)
         wants = ground.messages > 0 and not ground.whole
         self._at(at_ns, lambda: self._on_report(said, wants=wants))
 
@@ -399,7 +409,17 @@ class LiveFlight:
 
     def drained(self, second: float) -> float:
         """The second at which the link had carried what was sent before this one."""
-        return max((left for sent, left in self._left if sent < second), default=second)
+        return max((left for sent, left, _ in self._left if sent < second), default=second)
+
+    def carried_bps(self, begin: float, end: float) -> float:
+        return 8 * sum(size for _, left, size in self._left if begin <= left < end) / (end - begin)
+
+    def rate_between(self, begin: float, end: float) -> list[int]:
+        return [rate for second, rate in self.rates if begin <= second < end]
+
+    def delays_between(self, begin: float, end: float) -> list[float]:
+        """How old what came then was, of what could be shown; seconds."""
+        return [at - taken for at, taken in self.ground.shown if begin <= at < end]
 
     def longest_hole(self, begin: float, end: float) -> float:
         """The longest time without a frame that was shown, within these seconds."""
