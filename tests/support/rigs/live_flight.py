@@ -20,19 +20,21 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_common.values import AccessUnit, Frame, Image
+from hvt_common.values import AccessUnit, CameraUnit, Frame, Image
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check, check_rate
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.realtime import LinkControl
 from hvt_edge.operating import Keyframes, KeyframeSettings, Rates
+from hvt_edge.source.contract import CameraStream, SeenUnit
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder import Encoder, encoder_settings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.video.passthrough import Passthrough, PassthroughStage
 from hvt_edge.video.stage import Action
-from hvt_edge.wiring.link import make_budget, make_pacer
+from hvt_edge.wiring.link import make_budget, make_camera_rates, make_least_link, make_pacer
 from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, make_frame_skip
 from rigs.kept import INFO
 from rigs.messages import feedback
@@ -41,6 +43,7 @@ from rigs.world import make_base_stage, make_operating, make_reconfiguration, ma
 _REPORT_NS, _IDLE_REPORT_NS = SECOND_NS // 8, SECOND_NS // 2
 _PIXELS = np.zeros((8, 8, 3), np.uint8)
 _START_NS = 1_790_000_000 * SECOND_NS
+_CAMERA_SIZE = (1280, 720)
 
 
 @dataclass
@@ -133,7 +136,8 @@ class LiveFlight:
     long a message is under way, ``ahead_s(second)`` how far ahead the ground's clock. ``joins_s`` is when the ground
     comes. ``commands`` are ``(second, budget)``. ``store`` is a folder for what is stored while the link is
     away. To code a frame takes about ``coding_s``, a keyframe ``keyframe_times`` as long. The real x265 codes
-    ``pictures``, one after the other, for ever.
+    ``pictures``, one after the other, for ever. ``camera`` are units that are passed through, of a camera that took
+    ``surveyed`` when the flight began.
     """
 
     def __init__(
@@ -153,14 +157,17 @@ class LiveFlight:
         keyframe_times: float = 1.0,
         keyframe_s: float = 60.0,
         pictures: Sequence[Image] = (),
+        camera: Sequence[CameraUnit] = (),
+        surveyed: Sequence[CameraUnit] = (),
         loss: float = 0.0,
         seed: int = 0,
         **settings: Any,
     ) -> None:
-        self.config = config = check(EdgeConfig(source="demo", **settings))
-        size = config.fixed_size
-        assert size is not None, "given"
-        check_rate(config, size)
+        self.config = config = check(EdgeConfig(**{"source": "demo"} | settings))
+        size = config.fixed_size or _CAMERA_SIZE
+        if not camera:
+            check_rate(config, size)
+        self.camera = camera
         self.link, self.loss, self.late_s, self.joins_s = link, loss, late_s, joins_s
         self.way_s, self.ahead_s = way_s, ahead_s
         self.commands, self.pictures = list(commands), pictures or [_PIXELS]
@@ -176,7 +183,15 @@ class LiveFlight:
         """Seconds at which an encoder was opened."""
         self._left: list[tuple[float, float, int]] = []
         """(second at which a message was sent, second at which it had left, its bytes)."""
-        self.keyframes = Keyframes(KeyframeSettings(interval_ns=round(keyframe_s * SECOND_NS)))
+        self.stream = None
+        if camera:
+            seen = (SeenUnit(n / config.fps, len(one.data), one.keyframe) for n, one in enumerate(surveyed))
+            self.stream = CameraStream(tuple(seen), config.fps)
+            keyframe_s = 0
+        every_s = None if self.stream is None else self.stream.keyframe_s
+        self.keyframes = Keyframes(
+            KeyframeSettings(interval_ns=round(keyframe_s * SECOND_NS), camera_every_s=every_s)
+        )
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
         self._in_loop = False
@@ -184,9 +199,9 @@ class LiveFlight:
 
     def _build(self, size: tuple[int, int], store: Path | None) -> None:
         config = self.config
-        decimation = first_decimation(config, size)
+        decimation = 1 if self.camera else first_decimation(config, size)
         self.operating = make_operating(config, decimation=decimation)
-        self.pacer = make_pacer(config, None, size)
+        self.pacer = make_pacer(config, self.stream, size)
         outbox = Outbox()
         self.failures = Failures(self._clock)
         self.transmitter = make_transmitter(
@@ -229,6 +244,19 @@ class LiveFlight:
             ),
             failures=self.failures,
         )
+        self.stage: Any
+        if self.stream is not None:
+            self.stage = PassthroughStage(
+                Passthrough(),
+                keyframes=self.keyframes,
+                transmitter=self.transmitter,
+                failures=self.failures,
+                rates=make_camera_rates(config, self.stream, reconfiguration),
+                least_link=make_least_link(config, self.transmitter),
+                admits=self.link_control.admits,
+                pause=self._pause,
+            )
+            return
         self.stage = make_base_stage(
             self._opened(size, first_rates(config, decimation)),
             self.transmitter,
@@ -298,6 +326,10 @@ class LiveFlight:
 
     # Time
 
+    def _pause(self, pause_ns: int) -> int:
+        self._pass(self.now_ns + max(0, pause_ns))
+        return self.now_ns
+
     def _at(self, at_ns: int, call: Callable[[], None]) -> None:
         heapq.heappush(self._events, (at_ns, next(self._count), call))
 
@@ -336,11 +368,12 @@ class LiveFlight:
         try:
             for index in range(round(seconds * self.config.nominal_fps)):
                 taken_ns = _START_NS + round(index * SECOND_NS / self.config.nominal_fps)
-                if taken_ns < self.now_ns - SECOND_NS / self.config.nominal_fps:
-                    continue  # the loop was held up: a camera's frames are gone
+                if not self.camera and taken_ns < self.now_ns - SECOND_NS / self.config.nominal_fps:
+                    continue  # the loop was held up: a camera's frames are gone, its units wait
                 self._pass(taken_ns)
                 picture = self.pictures[index % len(self.pictures)]
-                self._frame(Frame(index, taken_ns, picture, picture))
+                unit = self.camera[index] if self.camera else None
+                self._frame(Frame(index, taken_ns, picture, picture, camera_unit=unit))
                 if self.now_ns >= status_ns:
                     status_ns = self.now_ns + SECOND_NS
                     self._status()
