@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
-from hvt_common.transport.zenoh_config import LinkSettings
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, router
 
@@ -127,20 +125,6 @@ def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_po
         eventually(lambda: b"base" in edges["rov-1"].reports, what="the ground's report arrives")
         eventually(lambda: set(edges["uav-1"].reports) == {b"base", b"guest"}, what="both reports arrive")
         assert edges["rov-1"].reports == [b"base"]
-
-
-def test_who_asks_with_keys_of_another_fleet_is_told(fleet: Fleet, tmp_path: Path, free_port: int) -> None:
-    """'Nobody answers' would be said of a ground that runs, and with keys may listen beyond this machine."""
-    other = Fleet(tmp_path / "other")
-    other.keys("add-ground", "base")
-    where = (f"tls/127.0.0.1:{free_port}",)
-    settings = LinkSettings("client", connect=where, zenoh_config=other.file("base"))
-    with (
-        open_session(fleet.settings("base", "ground", listen=(f"tls/0.0.0.0:{free_port}",))),
-        pytest.raises(UserError, match=r"^no link: tls/.*: its certificate was not signed by the CA in"),
-        open_session(settings),
-    ):
-        pass
 
 
 def test_a_router_says_who_is_not_named(fleet: Fleet, tmp_path: Path, free_port: int) -> None:

@@ -1,6 +1,5 @@
 """Models by name: fetched from a real HTTP server on loopback, brought by hand, checked before use."""
 
-import contextlib
 import hashlib
 import re
 import subprocess
@@ -14,8 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
@@ -25,7 +22,7 @@ from hvt_common.inference.store import embedded_models, resolve_model
 from hvt_models.command import main
 from hvt_models.heads import KINDS
 from hvt_models.inspect import inspect_model
-from hvt_models.manifest import builtin_manifest, parse_manifest
+from hvt_models.manifest import builtin_manifest
 from hvt_models.store import Store, cache_folder, file_digest
 from media.onnx_models import colour_classifier, colour_detector, constant_model
 from programs.small_disk import files_at_most
@@ -557,13 +554,6 @@ def test_a_wrong_manifest_of_the_user_is_one_sentence(folder: Path, text: str, w
     (folder / "added.toml").write_text(text)
     with pytest.raises(UserError, match=words):
         _ = Store(folder).entries
-
-
-@given(st.text(max_size=200))
-def test_no_manifest_ends_in_a_traceback(text: str) -> None:
-    """A damaged added.toml would crash every start."""
-    with contextlib.suppress(UserError):
-        assert parse_manifest(text, origin="it") == {}
 
 
 def test_the_cache_is_the_platforms_unless_the_user_names_one(

@@ -251,14 +251,6 @@ def test_objects_that_are_another_inside_are_refused(flight):
             backlog_content(key, data, edge=edge)
 
 
-@given(data=st.binary(max_size=400), kind=st.sampled_from(["info", "still", "base"]))
-@settings(max_examples=300, deadline=None)
-def test_any_bytes_are_refused_or_read(data, kind):
-    """One hostile object would end the ground."""
-    with pytest.raises(WireError):
-        backlog_content((7, kind, 0), data, edge="uav-1")
-
-
 @given(numbers=st.lists(st.integers(0, 20_000), max_size=80))
 @settings(max_examples=100, deadline=None)
 def test_numbers_are_known_again_in_any_order(numbers):
