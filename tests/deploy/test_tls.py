@@ -13,7 +13,6 @@ from hvt_common.transport.session import declare_publisher, open_session, query,
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, router
 
-DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 EDGES = ("rov-1", "uav-1")
 WRITTEN = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.STATUS)
 

@@ -185,8 +185,9 @@ class LiveFlight:
         """(second at which a message was sent, second at which it had left, its bytes)."""
         self.stream = None
         if camera:
-            seen = (SeenUnit(n / config.fps, len(one.data), one.keyframe) for n, one in enumerate(surveyed))
-            self.stream = CameraStream(tuple(seen), config.fps)
+            fps = config.nominal_fps
+            seen = (SeenUnit(n / fps, len(one.data), one.keyframe) for n, one in enumerate(surveyed))
+            self.stream = CameraStream(tuple(seen), fps)
             keyframe_s = 0
         every_s = None if self.stream is None else self.stream.keyframe_s
         self.keyframes = Keyframes(
