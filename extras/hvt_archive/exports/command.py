@@ -16,6 +16,7 @@ from itertools import islice
 from pathlib import Path
 
 import av.error
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -73,17 +74,17 @@ def _table(rows: Sequence[tuple[object, ...]], schema: pa.Schema) -> pa.Table:
 
 
 def write_mot(recorded: Recorded, path: Path) -> None:
-    """``frame,id,x,y,w,h,confidence,-1,-1,-1``: base pixels, frames from 1 (MOTChallenge, Dendorfer et al., 2020).
+    """``frame,id,x,y,w,h,confidence,-1,-1,-1``: frames and base pixels from 1 (MOTChallenge, Dendorfer et al., 2020).
 
     Tracks that stills doubt are left out: the format has no word for them.
     """
-    doubted = TRACK_COLUMNS.index("doubted")
     with path.open("w", encoding="utf-8") as file:
         for overlay in recorded.overlays():
-            for row in track_rows(overlay):
-                if not row[doubted]:
-                    _, _, *values = row[: TRACK_COLUMNS.index("confidence") + 1]
-                    file.write(",".join(map(str, (overlay.frame_index + 1, *values))) + ",-1,-1,-1\n")
+            for row in np.flatnonzero(~overlay.doubted).tolist():
+                x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
+                box = f"{x1 + 1:.1f},{y1 + 1:.1f},{x2 - x1:.1f},{y2 - y1:.1f}"
+                said = f"{overlay.track_ids[row]},{box},{overlay.confidences[row]:.3f}"
+                file.write(f"{overlay.frame_index + 1},{said},-1,-1,-1\n")
 
 
 def _rows(recorded: Recorded) -> Iterator[tuple[object, ...]]:

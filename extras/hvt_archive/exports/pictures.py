@@ -68,7 +68,7 @@ def _annotations(
             {
                 "id": first + len(found),
                 "image_id": image["id"],
-                "category_id": numbers.setdefault(overlay.classes[row], len(numbers) + 1),
+                "category_id": numbers.setdefault(overlay.words[row], len(numbers) + 1),
                 "bbox": [x1, y1, x2 - x1, y2 - y1],
                 "area": (x2 - x1) * (y2 - y1),
                 "iscrowd": 0,

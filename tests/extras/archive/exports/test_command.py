@@ -187,7 +187,8 @@ def test_the_tracks_are_those_that_the_ground_had(recording, events, tmp_path):
         assert (typed["frame_index"], typed["id"], typed["class"]) == (frame, track, row["class"])
         x1, y1, x2, y2 = overlay.boxes_base_px[at].tolist()
         off.append(np.subtract([float(row[one]) for one in "xywh"], [x1, y1, x2 - x1, y2 - y1]))
-        assert mot.loc[(frame + 1, track), "Width"] == pytest.approx(float(row["w"]), abs=0.06)
+        of_mot = mot.loc[(frame + 1, track), ["X", "Y", "Width", "Height"]].tolist()
+        assert of_mot == pytest.approx([float(row[one]) for one in "xywh"], abs=0.06), "and its pixels from 1"
     # Boxes are held while they move by less than a pixel, and written less often where bytes are scarce.
     assert np.percentile(np.abs(off), 90) < 3
     assert rows[0]["capture_utc"] == "2026-09-21T14:13:20.000Z"

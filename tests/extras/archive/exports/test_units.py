@@ -3,6 +3,7 @@
 import json
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,6 +30,7 @@ OVERLAY = overlay(
     confidences=np.array([0.8764], np.float32),
     places=Places(np.array([[52.0, 13.0]]), np.array([[3.0, 2.0, 0.0]])),
 )
+GUESS = replace(OVERLAY, vague=np.ones(1, np.bool_))
 RECORDED: Any = SimpleNamespace(
     edge="uav-1",
     session="00ff",
@@ -122,3 +124,13 @@ def test_an_export_has_the_units_of_the_table(kind, tmp_path, monkeypatch):
     picture = np.zeros((72, 128, 3), np.uint8)
     monkeypatch.setattr(pictures, "pictures", lambda one: [(one.video[0], picture, OVERLAY)])
     assert globals()[f"_{kind}"](tmp_path / f"flight.{kind}") == _documented()[kind]
+
+
+def test_a_guess_is_no_label(tmp_path, monkeypatch):
+    """A vehicle whose kind the ground guessed would teach a detector that it is a car."""
+    monkeypatch.setattr(
+        pictures, "pictures", lambda one: [(one.video[0], np.zeros((72, 128, 3), np.uint8), GUESS)]
+    )
+    pictures.write_coco(RECORDED, tmp_path)
+    (kind,) = json.loads((tmp_path / "annotations.json").read_text())["categories"]
+    assert (kind["name"], GUESS.classes) == ("vehicle", OVERLAY.classes)
