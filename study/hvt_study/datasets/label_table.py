@@ -19,7 +19,14 @@ import numpy.typing as npt
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
-from hvt_study.datasets.labels import NO_ID, FrameLabels, check_pixels, covered_share, inside_frame
+from hvt_study.datasets.labels import (
+    NO_ID,
+    FrameLabels,
+    check_inside,
+    check_pixels,
+    covered_share,
+    inside_frame,
+)
 
 _COVERED = 0.5
 """An object with so much of it in regions of which nothing is known does not count, as in VisDrone's toolkit."""
@@ -70,10 +77,13 @@ class LabelTable:
     ) -> LabelTable:
         """Those rows that are ``judged``, cut at the frame of this (width, height); empty ones are left out.
 
-        A number below 0, or of two objects of a frame, as where all have 0, says nothing of who is who.
+        A number below 0, or of two objects of a frame, as where all have 0, says nothing of who is who. Raises
+        `UserError` where many lie outside the frame.
         """
         check_pixels(rows.path, [rows[side] for side in "xywh"])
-        frames, boxes = rows["frame"].astype(np.int64), inside_frame(rows.boxes(origin=origin), size)
+        frames, boxes = rows["frame"].astype(np.int64), rows.boxes(origin=origin)
+        check_inside(rows.path, boxes[judged], size)
+        boxes = inside_frame(boxes, size)
         regions = inside_frame(ignored.boxes, size)
         places = _rows_with_area(ignored.frames, regions)
         chosen = _rows_with_area(frames, boxes)

@@ -12,6 +12,8 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.values import Boxes
 
+_MOST_OUTSIDE = 0.2
+"""Share of boxes around objects that have left the picture; of pictures at half their size three quarters are so."""
 _NOTICED_PX = 0.01
 """Rows that end nearer to the edge are as exact as their digits."""
 IGNORED = frozenset({"difficult", "dontcare", "ignore", "ignored"})
@@ -158,6 +160,17 @@ def check_pixels(path: Path, numbers: npt.ArrayLike) -> None:
     sides = sides[np.isfinite(sides)]
     if 0 < np.abs(sides).max(initial=0) <= 1 and (sides % 1).any():
         raise UserError(f"{path} has boxes of 0 to 1, and boxes are in pixels there")
+
+
+def check_inside(path: Path, boxes: Boxes, size: tuple[int, int]) -> None:
+    """Raise `UserError` where boxes of a file lie outside its pictures of (width, height): others were labelled."""
+    centres = (boxes[:, :2] + boxes[:, 2:]) / 2
+    outside = ((centres < 0) | (centres > size)).any(axis=1).sum()
+    if outside > _MOST_OUTSIDE * len(boxes):
+        raise UserError(
+            f"{path} has {outside} of {len(boxes)} boxes outside its pictures of {size[0]}x{size[1]}: put the "
+            "pictures back that were labelled, as large and turned as they were"
+        )
 
 
 def covered_share(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.float64]:

@@ -133,6 +133,20 @@ def test_a_bad_annotation_costs_itself_and_is_named_with_file_and_line(tmp_path,
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("scheme", ["visdrone", "uavdt", "mot"])
+def test_labels_of_larger_or_turned_pictures_are_refused(tmp_path, scheme):
+    """Boxes of large pictures on small ones, or beside those that an EXIF tag turns: recall 0 without a word."""
+    write = {"visdrone": lambda: write_visdrone(tmp_path, "a"), "uavdt": lambda: write_uavdt(tmp_path)}
+    write.get(scheme, lambda: write_mot(tmp_path / "a", info="[Sequence]\nframeRate=25\n"))()
+    open_dataset(f"{scheme}:{tmp_path}")
+    for file in tmp_path.rglob("*.png"):
+        cv2.imwrite(str(file), np.zeros((SIZE[0] // 8, SIZE[1] // 8, 3), np.uint8))
+    with pytest.raises(
+        UserError, match=r"boxes outside its pictures of 12x20: put the pictures back that were"
+    ):
+        open_dataset(f"{scheme}:{tmp_path}")
+
+
 A = "sequences/a"
 
 
