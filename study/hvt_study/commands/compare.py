@@ -15,6 +15,7 @@ from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.runtime.reporting import write_json
 from hvt_study.commands import arguments as common
 from hvt_study.commands import output
+from hvt_study.datasets.label_files import in_any_case
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.datasets.virtual_camera import SCHEME
 from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, CompareRow, compare
@@ -205,7 +206,7 @@ def command_of(plan: ComparePlan, row: CompareRow) -> str:
 def _source(plan: ComparePlan) -> tuple[str, ...]:
     if plan.clip.startswith(SCHEME):
         return ("CAMERA",)
-    pictures = Path(plan.clip) / "img1"
+    pictures = in_any_case(Path(plan.clip) / "img1")
     return (str(pictures),) if pictures.is_dir() else (plan.clip,)
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias
 
 from hvt_common.errors import UserError
 from hvt_edge.wiring import default_size
+from hvt_study.datasets.label_files import in_any_case
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, open_camera
@@ -122,7 +123,7 @@ def compare(
 
     Raises `UserError` where the clip, a detector or a rate cannot be used.
     """
-    uri, sequence = _opened(plan)
+    uri, sequence = opened(plan)
     if plan.labels == "exact" and sequence.labels is None:
         raise UserError(f"--labels exact: {plan.clip} does not say what it shows; leave --labels out")
     labels = "reference" if sequence.labels is None or plan.labels == "reference" else "exact"
@@ -171,7 +172,7 @@ def _shapes(spec: RunSpec) -> tuple[bool, int]:
     return method.any_size, len(method.fps_choices)
 
 
-def _opened(plan: ComparePlan) -> tuple[str, Sequence]:
+def opened(plan: ComparePlan) -> tuple[str, Sequence]:
     """The clip as a dataset of one sequence."""
     clip = plan.clip
     options: dict[str, str] = {}
@@ -181,7 +182,7 @@ def _opened(plan: ComparePlan) -> tuple[str, Sequence]:
         camera = open_camera(clip, fps=1)  # names faults of picture and height
         uri = f"{SCHEME}{camera.picture_path}"
         options["view"] = f"{camera.view_heights:g}"
-    elif (Path(clip) / "gt" / "gt.txt").is_file():
+    elif in_any_case(Path(clip) / "gt" / "gt.txt").is_file():
         uri = f"mot:{clip}"
     elif Path(clip).exists():
         uri = f"clips:{clip}"

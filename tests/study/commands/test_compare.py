@@ -10,9 +10,11 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_scene import Scene
 from hvt_study.cli import main
-from hvt_study.matrix.compare import COMPARED, CompareResult, Missing
+from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, Missing, opened
 from hvt_study.report.figures.drawing import plot, style_of
 from hvt_study.runs.methods import DDS, METHODS
+from hvt_study.runs.spec import ModelChoice
+from studies.layouts import write_mot
 
 FIRST_COLUMNS = [
     *("clip", "rate_kbps", "method", "half", "named_f1", "false_per_frame", "f1", "class_agreement"),
@@ -48,6 +50,17 @@ def test_what_cannot_be_flown_is_one_sentence(tmp_path, capsys, arguments, said)
     assert said in text
     assert "Traceback" not in text
     assert len([line for line in text.strip().splitlines() if not line.startswith("runs: ")]) == 1
+
+
+def test_labels_of_a_clip_are_found_in_any_case(tmp_path):
+    """A sequence of a system that writes GT was judged by what the detector says, not by its labels."""
+    write_mot(tmp_path / "a")
+    (tmp_path / "a" / "gt").rename(tmp_path / "a" / "GT")
+    (tmp_path / "a" / "GT" / "gt.txt").rename(tmp_path / "a" / "GT" / "gt.TXT")
+    plan = ComparePlan(
+        str(tmp_path / "a"), ModelChoice("aerial-nano", "aerial-nano"), (), tmp_path, labels="exact"
+    )
+    assert opened(plan)[1].labels is not None
 
 
 @pytest.mark.parametrize("methods", ["M5-jpeg", pytest.param("M0,M5-jpeg", marks=pytest.mark.nightly)])
