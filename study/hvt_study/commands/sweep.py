@@ -3,7 +3,6 @@
 import argparse
 import csv
 import io
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from hvt_edge.source.video import VideoSource
 from hvt_edge.stills.policy.selectors import SELECTORS
 from hvt_study.commands.arguments import check_whole, option
 from hvt_study.commands.output import check_out, print_columns, writing
+from hvt_study.datasets.annotation_rows import LARGEST
 
 COLUMNS = ("policy", "selected", "ratio", "frame_coverage")
 _INPUT_COLUMNS = ("frame", "x1", "y1", "x2", "y2", "conf", "class")
@@ -108,8 +108,10 @@ def _parsed(line: dict[str, str], *, path: Path, number: int) -> tuple[int, list
         name = line["class"].strip()
     except (ValueError, TypeError, AttributeError):
         raise UserError(f"{path} line {number} is not {','.join(_INPUT_COLUMNS)}: {line}") from None
-    if not all(math.isfinite(value) for value in numbers) or not name:
-        raise UserError(f"{path} line {number} has a number that is not finite, or no class: {line}")
+    if not all(abs(value) < LARGEST for value in numbers) or not name:  # nor for NaN
+        raise UserError(
+            f"{path} line {number} has a number that is not below {LARGEST:g}, or no class: {line}"
+        )
     return frame, numbers[:4], numbers[4], name
 
 

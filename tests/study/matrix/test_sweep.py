@@ -48,7 +48,7 @@ def test_known_answer(tmp_path, capsys):
     [
         ("frame,x1,y1\n0,1,2\n", "has no column x2, y2, conf, class"),
         (DETECTIONS.partition("\n")[0], "has no raw detections"),
-        (DETECTIONS + "7,0,0,nan,9,0.5,car\n", "not finite"),
+        *((DETECTIONS + f"7,0,0,{x},9,0.5,car\n", "not below 1e+09") for x in ("nan", "1e300")),
         (DETECTIONS + "7,0,0,x,9,0.5,car\n", "line 8"),
         (DETECTIONS + "7,0\n", "line 8"),
         (DETECTIONS + f"7,0,0,9,9,0.5,{'x' * 200_000}\n", "cannot be read (field larger than field limit"),
