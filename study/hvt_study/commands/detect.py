@@ -24,7 +24,7 @@ from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import check_whole, names_of, option
-from hvt_study.commands.output import RunProgress, check_out, decimals, print_columns, writing
+from hvt_study.commands.output import ONE_TARGET, RunProgress, check_out, decimals, print_columns, writing
 from hvt_study.datasets.class_map import VEHICLE, VEHICLES
 from hvt_study.datasets.label_files import read_image
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures
@@ -297,6 +297,6 @@ def print_score(score: dict[str, Any]) -> None:
     print_columns(title, heads, rows, words=("",))
     error = score["calibration_error"]
     if "recall_only" in score:
-        print("one target is labelled, all else that is in view is not: recall alone can be said")
+        print(ONE_TARGET)
         return
     print("expected calibration error " + decimals(error))

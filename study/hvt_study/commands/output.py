@@ -17,6 +17,7 @@ from hvt_common.errors import FlightError, UserError, telling
 from hvt_common.files import locked
 from hvt_common.runtime.reporting import check_writable, say
 
+ONE_TARGET = "one target is labelled, all else that is in view is not: recall alone can be said"
 _WIDTH = 100
 _LINE_EVERY_S = 60
 _FIRST_LINE_S = 1.0

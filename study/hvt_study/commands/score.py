@@ -9,7 +9,7 @@ from hvt_common.errors import UserError
 from hvt_common.units import parse_size
 from hvt_scene import Scene
 from hvt_study.commands.arguments import option
-from hvt_study.commands.output import print_columns
+from hvt_study.commands.output import ONE_TARGET, print_columns, print_lines
 from hvt_study.metrics.classes import ClassScore
 from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
 
@@ -17,11 +17,14 @@ _ROWS: tuple[tuple[str, Callable[[ClassScore], float]], ...] = (
     ("found (recall at IoU 0.5)", lambda one: one.recall),
     ("class right, of those found (top-1)", lambda one: one.counts.top1_found),
     ("the same of small objects", lambda one: one.by_size["small"].top1_found),
-    ("macro-F1", lambda one: one.macro_f1_all),
     ("found with the right class", lambda one: one.counts.top1_all),
+)
+_OF_ALL_ROWS: tuple[tuple[str, Callable[[ClassScore], float]], ...] = (
+    ("macro-F1", lambda one: one.macro_f1_all),
     ("named F1", lambda one: one.named_f1),
     ("false objects a frame", lambda one: one.false_per_frame),
 )
+"""Where all objects are labelled."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(
             f"--classes {arguments.classes!r} has an empty name: give names between commas, from class 1 on"
         )
-    truth = read_truth(arguments.truth, class_names=names)
+    truth, one_target = read_truth(arguments.truth, class_names=names)
     columns: list[tuple[str, ClassScore]] = []
     for spec in arguments.tracks:
         name, separator, path = spec.rpartition("=")
@@ -49,14 +52,16 @@ def run(arguments: argparse.Namespace) -> int:
         label = name if separator else file.stem
         tracks = read_tracks(file)
         columns.append((label, score(tracks, truth, frame_area_px=width * height)))
-    _print(columns)
+    _print(columns, one_target=one_target)
     return 0
 
 
-def _print(columns: Sequence[tuple[str, ClassScore]]) -> None:
+def _print(columns: Sequence[tuple[str, ClassScore]], *, one_target: bool) -> None:
     rows = [("objects on all frames", *(f"{one.counts.labels}" for _, one in columns))]
-    for label, figure in _ROWS:
+    for label, figure in _ROWS if one_target else (*_ROWS, *_OF_ALL_ROWS):
         figures = [figure(one) for _, one in columns]
         rows.append((label, *("-" if math.isnan(one) else f"{one:.3f}" for one in figures)))
     heads = ("", *(name for name, _ in columns))
     print_columns("What the ground knows, on every frame", heads, rows, words=("",))
+    if one_target:
+        print_lines(ONE_TARGET)

@@ -14,6 +14,7 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.files import MOST_TABLE_BYTES, read_text
+from hvt_study.datasets.annotation_rows import LARGEST
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.mot import read_truth_rows
 from hvt_study.metrics.classes import ClassScore, class_score
@@ -56,16 +57,17 @@ def _lines(table: csv.DictReader[str]) -> Iterator[tuple[int, list[float], str]]
         raise KeyError("class")
     for line in table:
         x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
-        if not math.isfinite(x + y + w + h):
+        if not all(abs(side) < LARGEST for side in (x, y, w, h)):  # nor for NaN
             raise ValueError(f"line {table.line_num} has no box")
         frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
         yield frame, [x, y, x + w, y + h], line["class"]
 
 
-def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, FrameLabels]:
+def read_truth(path: Path, *, class_names: Sequence[str]) -> tuple[dict[int, FrameLabels], bool]:
     """Read MOTChallenge ground truth (``frame,id,x,y,w,h,1,class,visibility``) by frame; hidden ones stand beside.
 
-    Raises `UserError` where a line is wrong, or no object counts.
+    And whether one target is labelled, so that nobody knows which other boxes are wrong. Raises `UserError` where a
+    line is wrong, or no object counts.
     """
     rows = read_truth_rows(path, class_names)
     if not rows.judged.any():
@@ -78,7 +80,7 @@ def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, FrameLabe
         counts = np.flatnonzero(here & rows.judged)
         names = [rows.class_names[row] for row in counts.tolist()]
         found[frame] = FrameLabels.plain(rows.boxes[counts], names, beside=rows.boxes[here & ~rows.judged])
-    return found
+    return found, rows.one_target
 
 
 def score(

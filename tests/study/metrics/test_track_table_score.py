@@ -41,7 +41,8 @@ def test_who_lists_a_hidden_object_is_neither_right_nor_wrong(tmp_path):
     """A ground that sees more than was judged would be scored worse for it."""
     lines = ["1,1,1,1,10,10,1,1,1.0", "1,2,51,1,20,20,1,1,0.2"]
     (tmp_path / "gt.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    truth = read_truth(tmp_path / "gt.txt", class_names=("car",))
+    truth, one_target = read_truth(tmp_path / "gt.txt", class_names=("car",))
+    assert not one_target
     seen = (0.0, 0.0, 10.0, 10.0, "car")
     results = [
         score({1: shown(seen, *more)}, truth, frame_area_px=AREA_PX)
@@ -118,7 +119,7 @@ def test_wrong_files_are_one_sentence(tmp_path, capsys):
     junk = tmp_path / "junk.csv"
     for text in (
         "",
-        "frame,x,y,w,h,class\n1,nan,2,3,4,car\n",
+        *(f"frame,x,y,w,h,class\n1,{x},2,3,4,car\n" for x in ("nan", "1e300")),
         'frame,x,y,w,h,class\n1,1,2,3,4,"' + "car" * 50_000,  # a quotation mark that nothing closes
         "a,b\n1,2\n",
     ):
@@ -167,6 +168,17 @@ def test_truth_without_classes_counts(tmp_path, capsys, caplog):
     assert "name no class: all are pedestrian" in caplog.text
     code, table, _ = scored(tmp_path, capsys, b"1,1,10,10,50,30,1,-1,-1,-1\n", "--classes", "person")
     assert "│ class right, of those found (top-1) │ 0.000 │" in table
+
+
+def test_of_one_target_nothing_is_said_to_be_false(tmp_path, capsys):
+    """Every other car that the ground shows was a false object, and named F1 .1 where the target was always found."""
+    for truth, whole in (
+        (b"1,1,11,11,50,30,1,1,1\n", False),
+        (b"1,1,11,11,50,30,1,1,1\n1,2,1,1,9,9,0,1,1\n", True),
+    ):
+        code, table, _ = scored(tmp_path, capsys, truth, "--classes", "pedestrian")
+        assert (code, "│ found (recall at IoU 0.5)           │ 1.000 │" in table) == (0, True)
+        assert ("named F1" in table, "recall alone can be said" in table) == (whole, not whole)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from collections.abc import Sequence as Names
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -107,6 +108,8 @@ class TruthRows:
     """(N,) False for boxes that do not count, and for half-hidden ones."""
     classless: bool
     """MOT15's ten columns, which name no class: all are of the only name that was given, else pedestrians."""
+    one_target: bool
+    """One object is labelled, and nothing else that is in view."""
 
 
 def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
@@ -126,7 +129,8 @@ def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
     if not classless:
         share = rows["visibility"]
         judged &= (share >= _LEAST_VISIBLE) | (share < 0)  # -1 where the file does not say
-    return TruthRows(rows["frame"].astype(np.int64), rows.boxes(origin=1.0), words, judged, classless)
+    alone = _one_target(rows["frame"], rows["id"]) and bool((rows["counts"] != 0).all())
+    return TruthRows(rows["frame"].astype(np.int64), rows.boxes(origin=1.0), words, judged, classless, alone)
 
 
 def _class_text(highest: int) -> str:
@@ -168,13 +172,17 @@ def _open(name: str, folder: Path, options: Options) -> Sequence:
     fps = options.fps or _rate(about, said)
     labels = _labels(folder, said, images) if options.annotated else None
     sequence = images.sequence(name=name, dataset="mot", fps=fps, labels=labels)
-    return sequence if labels is None else replace(sequence, one_target=_one_target(labels.table()))
+    if labels is None:
+        return sequence
+    table = labels.table()
+    alone = _one_target(table.frames, table.ids) and not len(table.ignored.frames)
+    return replace(sequence, one_target=alone)
 
 
-def _one_target(table: LabelTable) -> bool:
-    """Whether it is a single-object set: one id, once a frame, and nothing marked as not counting."""
-    alone = len(np.unique(table.frames)) == len(table.frames)
-    return alone and len(np.unique(table.ids)) == 1 and table.ids[0] >= 0 and not len(table.ignored.frames)
+def _one_target(frames: npt.NDArray[Any], ids: npt.NDArray[Any]) -> bool:
+    """Whether it is a single-object set, where all count: one id, once a frame."""
+    once = len(np.unique(frames)) == len(frames)
+    return once and len(np.unique(ids)) == 1 and bool(ids[0] >= 0)
 
 
 def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
