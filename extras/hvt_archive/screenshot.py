@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from rerun.experimental import ViewerClient
 
+from hvt_archive.viewer import free_port, started_viewer
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
-from hvt_ground.sinks.rerun.live_view import free_port, started_viewer
 
 _START_S, _SETTLE_S = 30.0, 4.0
 _MENU_PX = 37

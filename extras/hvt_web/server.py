@@ -63,6 +63,8 @@ class WebPage(Service):
     on this machine answers. Raises `UserError` where the address, the tokens or the keys cannot be used.
     """
 
+    part = _PART
+
     def __init__(
         self,
         address: str,

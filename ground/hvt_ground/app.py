@@ -37,7 +37,6 @@ from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs, Sink
-from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.wiring import (
     Models,
     OpenSink,
@@ -88,8 +87,6 @@ class _Parts:
     services: Sequence[Service]
     watchers: Sequence[_Watcher]
     line: StatusLine
-    page: str
-    """The address of the viewer."""
 
 
 class Ground:
@@ -157,9 +154,6 @@ class Ground:
     def _fly(self, models: Models) -> None:
         config = self._config
         with ExitStack() as stack:
-            view: LiveView | None = None
-            if config.view or config.serve:
-                view = stack.enter_context(LiveView("spawn" if config.view else "serve", later=True))
             if config.metrics is not None:
                 server = health_server(
                     "ground",
@@ -190,12 +184,11 @@ class Ground:
                 models,
                 clock=self._clock,
                 outputs=outputs,
-                view=view,
                 services=services,
                 program=self._program,
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
-            parts = _Parts(models, factory, services, watchers, line, "" if view is None else view.page)
+            parts = _Parts(models, factory, services, watchers, line)
             try:
                 while self._serve_link(session, parts):
                     links.close()
@@ -286,10 +279,10 @@ class Ground:
         if config.listen or not (config.connect or config.zenoh_config):
             yet = "not yet " * ("listener" in late)
             note(f"hvt-ground: {yet}listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
-        for page in filter(None, (parts.page, *(link for one in parts.services for link in one.links))):
-            # Another program may answer there.
-            yet = "not yet, " * (page != parts.page and "web page" in late)
-            note(f"hvt-ground: {yet}watch at {page}")
+        for service in parts.services:
+            yet = "not yet, " * (service.part in late)  # another program may answer there
+            for page in service.links:
+                note(f"hvt-ground: {yet}watch at {page}")
 
     def _serve(self, link: GroundLink, parts: _Parts, watch: LinkWatch, group: Group | None) -> None:
         config, models, polls = self._config, parts.models, 0

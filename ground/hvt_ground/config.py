@@ -125,8 +125,6 @@ class GroundConfig:
     split: Limit | None = _FILES.option(
         _LIMIT, None, "begin a new file of the recording after this time or size, at the next keyframe"
     )
-    view: bool = _FILES.switch("also open the Rerun viewer")
-    serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
     metrics: str | None = _FILES.option(
         TEXT,
         None,
@@ -179,8 +177,6 @@ def check(config: GroundConfig, *, more: Iterable[Written] = ()) -> GroundConfig
     check_apart(files)  # files in a folder have names of their own
     if config.group is not None:
         link_doctor().sharer()  # refused here, before anything is opened or written
-    if config.view and config.serve:
-        raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):
         raise UserError(
             f"--labels {config.labels} names a classifier's classes, but --classifier is no file: give one"

@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_ground.recordings.row import Recorded, RecordingRow
     from hvt_ground.report.state import GroundState
     from hvt_ground.sinks import Outputs, Sink, SinkWriter
+    from hvt_ground.sinks.rerun.recorder import RecorderSettings
 
 Options = TypeVar("Options", bound=GroundConfig)
 
@@ -35,7 +36,7 @@ _BRINGS = {
     "cot": ("cot", "cot-types"),
     "mcap": ("mcap",),
     "terrain": ("terrain",),
-    "ground": ("ts", "keep", "keep-video", "log", "log-size", "tracks", "stills", "timing"),
+    "ground": ("ts", "keep", "keep-video", "log", "log-size", "tracks", "stills", "timing", "view", "serve"),
     "web": ("web", "web-proxy"),
 }
 _BROUGHT_BY = {setting: package for package, settings in _BRINGS.items() for setting in settings}
@@ -54,6 +55,8 @@ class Flight:
     info: Info
     locator: Locator
     """Gives its tracks places on the map."""
+    recording: RecorderSettings
+    """Of a recording of it, without a file."""
     clock: Callable[[], int]
     """The ground's steady clock, nanoseconds."""
     new_file: NewFile
@@ -92,6 +95,8 @@ class Service:
 
     links: Sequence[str] = ()
     """Where somebody can watch."""
+    part: str = ""
+    """The part that fails while the links lead nowhere yet."""
     shown_to_others: str = ""
     """Such a link that other machines reach, without secrets."""
 

@@ -50,7 +50,7 @@ def test_a_setting_of_an_extra_that_is_absent(words, package):
 def test_extras_bring_what_the_core_has_not():
     """Two of one name would hide each other."""
     settings = sorted(one for extra in all_extras() for one in vars(extra.options)["__annotations__"])
-    known = "cot cot_types keep keep_video log log_size mcap stills terrain timing tracks ts web web_proxy"
+    known = "cot cot_types keep keep_video log log_size mcap serve stills terrain timing tracks ts view web web_proxy"
     assert settings == known.split()
     assert not set(settings) & set(GroundConfig.__annotations__)
     named = vars(config_class(()))["GONE"]

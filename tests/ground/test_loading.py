@@ -72,7 +72,7 @@ class Loading:
     def __init__(self, flight: Flight, config: GroundConfig, **parts: Any) -> None:
         self.outputs, self.models = Outputs(Failures(time.time_ns)), Models(check(config))
         self.factory = SessionFactory(
-            check(config), self.models, clock=time.time_ns, outputs=self.outputs, view=None, **parts
+            check(config), self.models, clock=time.time_ns, outputs=self.outputs, **parts
         )
         self.ended: list[Session] = []
         port = Port()

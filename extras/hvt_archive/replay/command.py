@@ -15,12 +15,13 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from rich.progress import Progress
 
 from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.replay.message_log import read_log
+from hvt_archive.viewing import ViewerOptions, viewing
 from hvt_common.config import load
 from hvt_common.errors import Parser, UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, matches, parse_key
@@ -50,7 +51,6 @@ from hvt_ground.session.edge_port import InfoAnswer
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs
-from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.wiring import SessionFactory, check_outputs, make_folders
 
 _OF_EVERY_POSE = 0
@@ -235,10 +235,11 @@ class _Replay:
         with ExitStack() as stack:
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
-            view = None
-            if self._config.view or self._config.serve:
-                view = stack.enter_context(LiveView("spawn" if self._config.view else "serve"))
-            factory = SessionFactory(self._config, models, clock=self._clock, outputs=outputs, view=view)
+            view = viewing(cast("ViewerOptions", self._config))
+            services = [] if view is None else [stack.enter_context(view)]
+            factory = SessionFactory(
+                self._config, models, clock=self._clock, outputs=outputs, services=services
+            )
             for item in self._paced():
                 edge = (parse_key(item.key) or ("", None))[0]
                 if edge not in infos or not matches(edge, edges=self._config.edges):

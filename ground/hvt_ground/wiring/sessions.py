@@ -32,8 +32,7 @@ from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
-from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.recorder import RecorderSettings
 from hvt_ground.sinks.rerun.rrd_file import locked
 
 _log = logging.getLogger(__name__)
@@ -190,8 +189,6 @@ OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
 _Pictures = tuple[QueuedSink[Event], Callable[[Refinement, Path], str]]
 """A sink, and where its newest file has the picture of a still."""
 
-_LIVE_PAUSE_S = 5.0
-"""The longest pause before a failed live view is tried again."""
 _LOCKSTEP_WAIT_S = 10.0
 
 
@@ -199,7 +196,7 @@ _LOCKSTEP_WAIT_S = 10.0
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing there; ``services`` of extras
+    All that they write to is of ``outputs``; ``services`` of extras
     bring sinks and learn of the recordings, and ``program`` opens a sink of another program.
     """
 
@@ -208,7 +205,6 @@ class SessionFactory:
     _: KW_ONLY
     clock: Callable[[], int]
     outputs: Outputs
-    view: LiveView | None
     services: Sequence[Service] = ()
     program: OpenSink | None = None
 
@@ -241,13 +237,11 @@ class SessionFactory:
         if self.program is not None:
             part, opens = f"program of {edge}", self.program(info)
             sinks.append(self.outputs.open(part, opens, wait_s=wait_s, for_backlog=not self.records))
-        if self.view is not None:
-            open_live = partial(_live_recorder, settings, self.view)
-            sinks.append(self.outputs.open(f"live view of {edge}", open_live, longest_pause_s=_LIVE_PAUSE_S))
         pictures: list[_Pictures] = []
         flight = Flight(
             info,
             locator=locator,
+            recording=settings,
             clock=self.clock,
             new_file=partial(self._new_file, edge=edge, stamp=stamp),
             still_address=partial(self._still_address, info, pictures),
@@ -333,8 +327,3 @@ class SessionFactory:
             "classifier": Path(config.classifier or "none").name,
         }
         return RecorderSettings.of(info, None, facts=facts)
-
-
-def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:
-    view.start_again()
-    return Recorder(replace(settings, live_url=view.url))

@@ -286,7 +286,7 @@ def opened_factory(path: Path, folder: Path) -> tuple[SessionFactory, Outputs]:
     make: Any = config_class()
     config = check(make(record=folder, terrain=path, detector="motion", classifier="none"))
     outputs = Outputs(Failures(time.time_ns))
-    return SessionFactory(config, Models(config), clock=time.time_ns, outputs=outputs, view=None), outputs
+    return SessionFactory(config, Models(config), clock=time.time_ns, outputs=outputs), outputs
 
 
 def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):

@@ -16,7 +16,7 @@ from hvt_common.values import Pose, View
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, VideoSample
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
-from hvt_ground.sinks.rerun.live_view import viewer_program
+from hvt_ground.sinks.rerun.sdk import viewer_program
 from hvt_ground.sinks.rerun.still_places import SLOTS
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs import rrd

@@ -130,7 +130,7 @@ def served(link: GroundLink, folder: Path, ended: list[str], clock: Clock) -> It
     """The edge's thread with sessions as `hvt-ground` makes them; ``ended`` gets one word a session."""
     config = check(TableOptions(record=folder, tracks=folder, detector="motion", classifier="none"))
     outputs, models = Outputs(Failures(time.time_ns)), Models(config)
-    factory = SessionFactory(config, models, clock=clock, outputs=outputs, view=None)
+    factory = SessionFactory(config, models, clock=clock, outputs=outputs)
 
     def note(session: Session) -> None:
         assert summary(session)["frames_decoded"] == FRAMES, summary(session)

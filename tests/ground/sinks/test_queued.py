@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 
 from hvt_archive.exports.tables import LineFile
+from hvt_archive.viewer import LiveView
 from hvt_common.errors import UserError
 from hvt_common.runtime import failures as failures_module
 from hvt_common.runtime.failures import Failures
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.sinks import Outputs, QueuedSink
 from hvt_ground.sinks.queued import SinkWriter
-from hvt_ground.sinks.rerun.live_view import LiveView, listening
+from hvt_ground.sinks.rerun.live_view import listening
 from hvt_ground.sinks.rerun.recorder import Recorder
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
 from programs.processes import eventually, free_ports

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
+from hvt_archive.viewer import LiveView
 from hvt_common.config import load
 from hvt_common.errors import FlightError, NotYetError, UserError, exit_with_sentence
 from hvt_common.runtime.failures import Awaited, Failures
@@ -29,7 +30,7 @@ from hvt_edge.source.live import Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.world import World
 from hvt_fleet.health.server import Answer, HealthServer
-from hvt_ground.sinks.rerun.live_view import LiveView, listening
+from hvt_ground.sinks.rerun.live_view import listening
 from hvt_web.server import WebPage
 from programs.processes import answers, eventually, free_ports
 from programs.rtsp_camera import RtspCamera

@@ -32,8 +32,8 @@ from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.rerun.live_view import viewer_program
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.sdk import viewer_program
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs import rrd
 from programs.processes import eventually

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_archive.viewer import LiveView, free_port, viewer_program
 from hvt_common.errors import UserError
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.rerun import recorder as recorder_module
-from hvt_ground.sinks.rerun.live_view import LiveView, free_port, viewer_program
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
 from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS, Gallery, frame_of, placed
