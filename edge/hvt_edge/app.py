@@ -201,7 +201,7 @@ class Edge:
                     stages.status.send("running")
                     self._reached |= link.has_subscriber(Channel.BASE)
                     if heartbeat.state is not None:
-                        line.show(status_text(heartbeat.state, paused_s=self._counts.paused_ns / SECOND_NS))
+                        line.show(status_text(heartbeat.state, paused_s=self._counts.slow_ns / SECOND_NS))
                     more_frames = stages.base.wants_keyframe(self._counts.last_index)
                     if more_frames or stages.link.reconfiguration.wants_keyframe(now_ns):
                         stages.link.keyframes.require(now_ns)

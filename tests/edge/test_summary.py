@@ -38,7 +38,7 @@ def summary_of(
     counts = SimpleNamespace(
         duration_s=lambda _fps: 5.3,
         unanalyzed=unanalyzed,
-        paused_ns=clip_paused_s * 10**9,
+        slow_ns=clip_paused_s * 10**9,
         cpu=SimpleNamespace(short=Cores(needed=1.63, free=1.1)),
         encode_ms=20.0,
     )

@@ -137,7 +137,9 @@ class FrameCounts:
     """Coded, or left out by frame decimation, and skipped by perception, because stills or detection were behind."""
     encode_ns: int = 0
     paused_ns: int = 0
-    """Total time for which a clip's clock stood still, because the machine was too slow to play it in real time."""
+    """Total time for which a clip's clock stood still, because the next frame was not there in time."""
+    awaited_ns: int = 0
+    """The part of it for which the clip's file had to grow first."""
     newest_came_ns: int | None = None
     """When the source gave the newest frame; None before the first."""
     resumed_ns: int = 0
@@ -149,6 +151,11 @@ class FrameCounts:
     _source_before: tuple[int, int] = (0, 0)
     _measured: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
     """At the last measurement: frames captured, dropped as late, not analyzed; encoding and perception time."""
+
+    @property
+    def slow_ns(self) -> int:
+        """By how much a clip is played longer than it is, because the machine is too slow."""
+        return self.paused_ns - self.awaited_ns
 
     @property
     def captured(self) -> int:

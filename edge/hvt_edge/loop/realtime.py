@@ -20,7 +20,7 @@ from hvt_common.values import AccessUnit, Frame
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.operating import Keyframes
-from hvt_edge.source.live import IDLE_S
+from hvt_edge.source.contract import IDLE_S
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.reconfigure import EncoderReconfiguration
@@ -83,6 +83,8 @@ class RealtimePace:
         self._must_code_ns = 0
         self._lost_ns = -_STEADY_NS
         self._none_due_ns = 0
+        self._awaited = False
+        """The next frame was not there: its file has to grow first."""
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because of a slow link, not yet made up."""
         self._bound: FrameGroup = "processor"
@@ -99,11 +101,12 @@ class RealtimePace:
         )
 
     def steps(self, frames: Iterable[Frame | None]) -> Iterator[Frame | None]:
-        """``frames``, with None for each quarter of a second for which a clip's next one is not due."""
+        """``frames``, with None for each quarter of a second for which a clip's next one is not due or not there."""
         return iter(frames) if self.live else chain.from_iterable(map(self._when_due, frames))
 
     def _when_due(self, frame: Frame | None) -> Iterator[Frame | None]:
         # Ends with its frame: a loop over all would hold each while the next is read.
+        self._awaited |= frame is None
         while not (frame is None or self.stop.is_set()):
             if frame.capture_ns + self.counts.paused_ns - self.clock() <= IDLE_S * SECOND_NS:
                 break
@@ -184,12 +187,15 @@ class RealtimePace:
         self._worker.close()
 
     def _by_clip_clock(self, frame: Frame) -> Frame:
-        # Later where the machine is too slow; delay by the link is made up at twice the clip's speed.
+        # Later where the machine is too slow, or the file has to grow; delay by the link is made up at twice the
+        # clip's speed.
         now_ns = self.clock()
         self._link_late_ns = max(0, self._link_late_ns - (now_ns - self._sent_ns))
         late_ns = now_ns - frame.capture_ns - self.counts.paused_ns - self._link_late_ns
-        if late_ns > _MOST_LATE_NS:
+        if late_ns > (0 if self._awaited else _MOST_LATE_NS):
             self.counts.paused_ns += late_ns
+            self.counts.awaited_ns += late_ns if self._awaited else 0
+        self._awaited = False
         return replace(frame, capture_ns=frame.capture_ns + self.counts.paused_ns)
 
     def _in_time(self, frame: Frame) -> bool:

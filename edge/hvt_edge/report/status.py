@@ -233,7 +233,7 @@ def summary(of: Heartbeat, *, unreached: str) -> dict[str, Any]:
         "decisions": now.decisions.says,
         "preset": now.preset,
         "preset_says": now.preset_says,
-        "clip_paused_s": round(counts.paused_ns / SECOND_NS, 2),
+        "clip_paused_s": round(counts.slow_ns / SECOND_NS, 2),
         "budget_bps": now.highest_budget_bps,
         "budget_base_bps": now.base_bps,
         "keyframes": keyframes.sent,

@@ -31,10 +31,18 @@ from hvt_edge.source.camera_stream import (
     rate_of,
     without_jumps,
 )
-from hvt_edge.source.contract import BaseSize, CameraStream, ClipSource, Notes, SeenUnit, SourceSettings
+from hvt_edge.source.contract import (
+    IDLE_S,
+    BaseSize,
+    CameraStream,
+    ClipSource,
+    Notes,
+    SeenUnit,
+    SourceSettings,
+)
 from hvt_edge.source.decoding.container import about_times, name_of, open_video, packets_of, survey
 from hvt_edge.source.decoding.timeline import Stamps
-from hvt_edge.source.live import IDLE_S, SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
+from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.resample import Resizer
 from hvt_edge.source.stream import (
     FIRST_S,

@@ -6,17 +6,22 @@ import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import wait
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Self
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.log import START_LOGGER
+from hvt_common.runtime.process import in_thread
 from hvt_common.values import Fit, Frame, View
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or a function that gives it from the source's."""
 
+IDLE_S = 0.25
 _LEAST_SIDE_PX, _MOST_SIDE_PX = 64, 8192
 
 
@@ -99,7 +104,7 @@ class Source(ABC):
         """
 
     def steps(self, *, start_ns: int) -> Iterator[Frame | None]:
-        """`frames`, with None for each quarter of a second in which a live source has none."""
+        """`frames`, with None for each quarter of a second in which a live source, or a file that grows, has none."""
         yield from self.frames(start_ns=start_ns)
 
     def close(self) -> None:
@@ -118,15 +123,31 @@ class ClipSource(Source):
 
     live = False
     _running: Generator[Frame, None, None] | None = None
+    _growing = False
+    """A read at the end of the file waits for more."""
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         self.close()
         self._running = self._play(start_ns)
         return self._running
 
+    def steps(self, *, start_ns: int) -> Iterator[Frame | None]:
+        frames = self.frames(start_ns=start_ns)
+        while self._growing:
+            coming = in_thread(partial(next, frames, None), name="hvt-source", lowered=False)
+            while not wait([coming], timeout=IDLE_S).done:
+                yield None
+            frame = [coming.result()]
+            if frame[0] is None:
+                return
+            del coming  # or it would be held while the next is read
+            yield frame.pop()
+        yield from frames
+
     def close(self) -> None:
         if self._running is not None:
-            self._running.close()
+            with suppress(ValueError):  # its thread still waits for the file
+                self._running.close()
             self._running = None
 
     @abstractmethod

@@ -18,14 +18,13 @@ from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, Image
 from hvt_edge.source.camera_stream import CameraDecoder
-from hvt_edge.source.contract import BaseSize, Notes, Source, SourceSettings
+from hvt_edge.source.contract import IDLE_S, BaseSize, Notes, Source, SourceSettings
 from hvt_edge.source.resample import Gate, Resizer
 
 _log = logging.getLogger(__name__)
 
 FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 JOIN_S = 1.5
-IDLE_S = 0.25
 LEAST_PATIENCE_S, _MOST_PATIENCE_S = 2.0, 10.0
 _MOST_PENDING = 8
 """Most frames of a burst that are held."""

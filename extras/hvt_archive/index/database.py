@@ -93,9 +93,7 @@ class Index:
         So the files keep their ages and their order when the clock is set. The first to look with another clock
         moves them, of all grounds that have the folder.
         """
-        if (
-            not self._is_there()
-        ):  # all its files would seem to be gone, and a row would be in no folder
+        if not self._is_there():  # all its files would seem to be gone, and a row would be in no folder
             raise sqlite3.OperationalError(f"{self._path} was removed")
         with self._database as transaction:
             transaction.execute("BEGIN IMMEDIATE")

@@ -2,6 +2,7 @@
 
 import threading
 import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -19,6 +20,7 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.perception.cpu_budget import CpuBudget
+from hvt_edge.source.contract import IDLE_S
 from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
@@ -185,6 +187,25 @@ def test_a_clip_that_cannot_be_read_in_real_time_is_played_slower(reading_s):
     assert max(new - old for old, new in pairwise(shown_at)) / SECOND_NS <= most_s + 1e-6, (
         "none is left out for long"
     )
+
+
+def test_a_clip_that_waits_for_its_file_to_grow_blames_no_machine():
+    """At the end of each flight with --follow the summary said that this machine is too slow; or frames were lost."""
+    out = Out()
+
+    def grows() -> Iterator[Frame | None]:
+        for frame in framed(smooth_pictures(40, size=SIZE), fps=15):
+            for _ in range(3 if frame.index in (10, 30) else 0):
+                out.time.pass_s(IDLE_S)
+                yield None
+            yield frame
+
+    with paced(out, QuietStills()) as pace:
+        for frame in pace.steps(grows()):
+            pace.step(frame)
+    assert [one.frame_index for one in out.headers] == list(range(40))
+    assert pace.counts.paused_ns / SECOND_NS == pytest.approx(6 * IDLE_S, abs=0.2)
+    assert pace.counts.slow_ns == 0
 
 
 def test_no_unit_of_a_camera_is_left_out_of_a_clip_that_is_read_too_slowly():

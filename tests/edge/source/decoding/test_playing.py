@@ -3,6 +3,7 @@
 import gc
 import logging
 import shutil
+import threading
 from fractions import Fraction
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from hvt_common.errors import UserError
 from hvt_edge.source.decoding import container
 from hvt_edge.source.opening import open_source
 from media.numbered import copied, disc, number_of, numbered, patch, write_numbered
+from programs.processes import PATIENT_S
 
 
 def play(spec, *, fps=30.0, **settings):
@@ -438,17 +440,25 @@ def test_a_file_that_grows_is_followed(tmp_path, monkeypatch):
     growing = tmp_path / "growing.ts"
     half = len(whole) // 2 // 188 * 188
     growing.write_bytes(whole[:half])
-    slept = []
+    slept, turned = [], threading.Event()
+    turned.set()
 
     def sleep(seconds):
+        assert turned.wait(PATIENT_S), "the loop stands still: no status, no still, LINK LOST at the ground"
         slept.append(seconds)
         if len(slept) == 5:
             with growing.open("ab") as file:
                 file.write(whole[half:])
 
     monkeypatch.setattr(container, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: sum(slept)))
+    played = []
     with open_source(str(growing), size=lambda size: size, fps=30, growing=True) as source:
-        played = [number_of(frame.source_bgr) for frame in source.frames(start_ns=0)]
+        turned.clear()
+        for frame in source.steps(start_ns=0):
+            if frame is None:
+                turned.set()
+            else:
+                played.append(number_of(frame.source_bgr))
     assert played == list(range(90))
     assert sum(slept) < 2.5 * container.QUIET_S, "once where stamps are looked at, once at the end"
 
