@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -53,10 +53,10 @@ def detections_by_frame(rows: Rows) -> Iterator[tuple[int, Detections]]:
         yield frame, Detections(boxes[part], scores[part], np.zeros(len(scores[part]), np.int32))
 
 
-def rows_of_tracks(tracks: list[Tracks]) -> npt.NDArray[np.float64]:
-    """(N, 7) ``frame,id,x,y,w,h,score`` of all boxes of a list of frames, by frame and then by id."""
+def rows_of_tracks(tracks: Iterable[Tracks]) -> npt.NDArray[np.float64]:
+    """(N, 7) ``frame,id,x,y,w,h,score`` of all boxes of frames, by frame and then by id."""
     rows = [np.empty((0, 7))]
-    for each in tracks:
+    for each in filter(len, tracks):  # of the millions of frames between two detections nothing is kept
         boxes = each.boxes_xyxy_px.astype(np.float64)
         boxes[:, 2:] -= boxes[:, :2]
         frame = np.full(len(each), each.frame_index)
@@ -90,16 +90,19 @@ def run(arguments: argparse.Namespace) -> int:
     check_not_read(out, [source], name="--out")
     rows = read_detections(source)
     tracker = ByteTracker(settings, fps=arguments.fps)
-    tracks = [tracker.update(seen, frame_index=frame) for frame, seen in detections_by_frame(rows)]
-    found = rows_of_tracks(tracks)
+    found = rows_of_tracks(
+        tracker.update(seen, frame_index=frame) for frame, seen in detections_by_frame(rows)
+    )
     try:
         with out.open("w", encoding="utf-8") as file:
             np.savetxt(file, found, fmt="%d,%d" + 5 * ",%.4f" + 3 * ",-1")
     except OSError as error:
         raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+    frames = rows["frame"]
+    count = round(frames.max() - min(1, frames.min())) + 1 if len(rows) else 0
     empty = np.count_nonzero((rows.table[:, 4:6] <= 0).any(axis=1))
     print(
-        f"{out}: {len(tracks)} frames, {len(np.unique(found[:, 1]))} tracks, {len(found)} boxes"
+        f"{out}: {count} frames, {len(np.unique(found[:, 1]))} tracks, {len(found)} boxes"
         + (f"; {empty} detections without area left out" if empty else "")
     )
     return 0

@@ -1,12 +1,14 @@
 """``hvt-study track`` and the MOTChallenge files it reads and writes."""
 
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
 
+from hvt_common.values import Tracks
 from hvt_study.cli import main
-from hvt_study.commands.track import detections_by_frame, read_detections
+from hvt_study.commands.track import detections_by_frame, read_detections, rows_of_tracks
 
 LINE = "{frame},-1,{x},20,40,60,{score},-1,-1,-1\n"
 
@@ -59,6 +61,17 @@ def test_frames_without_detections_are_stepped(tmp_path):
         rows = read_detections(out)
         assert sorted(set(rows["id"].tolist())) == ids
         assert rows["frame"].max() == 19 + gap
+
+
+def test_nothing_is_kept_of_frames_without_tracks():
+    """Two lines of a file, ten million frames apart, took a kilobyte of memory for each frame between them."""
+    tracemalloc.start()
+    try:
+        found = rows_of_tracks(map(Tracks.none, range(20_000)))
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert (found.shape, most < 500_000) == ((0, 7), True)
 
 
 def test_options_reach_the_tracker(tmp_path):
