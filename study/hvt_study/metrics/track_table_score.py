@@ -44,7 +44,7 @@ def read_tracks(path: Path) -> dict[int, FrameView]:
         raise UserError(
             f"{path} cannot be read ({error.strerror}): give a table of hvt-ground --tracks"
         ) from None
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
+    except (ValueError, csv.Error) as error:
         raise UserError(
             f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"
         ) from None
@@ -52,14 +52,18 @@ def read_tracks(path: Path) -> dict[int, FrameView]:
 
 
 def _lines(table: csv.DictReader[str]) -> Iterator[tuple[int, list[float], str]]:
-    # Frame, box and class of each line; KeyError, TypeError or ValueError where there are none.
-    if "class" not in (table.fieldnames or ()):
-        raise KeyError("class")
+    # Frame, box and class of each line; ValueError where there are none.
+    missing = [name for name in (*"xywh", "class") if name not in (table.fieldnames or ())]
+    if missing:
+        raise ValueError(f"it has no column {', '.join(missing)}")
     for line in table:
-        x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
-        if not all(abs(side) < LARGEST for side in (x, y, w, h)):  # nor for NaN
-            raise ValueError(f"line {table.line_num} has no box")
-        frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
+        try:
+            x, y, w, h = (float(line[name]) for name in "xywh")
+            frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
+        except (KeyError, ValueError, TypeError):
+            x = y = w = h = math.nan
+        if line["class"] is None or not all(abs(side) < LARGEST for side in (x, y, w, h)):  # nor for NaN
+            raise ValueError(f"line {table.line_num} has no frame, box or class")
         yield frame, [x, y, x + w, y + h], line["class"]
 
 

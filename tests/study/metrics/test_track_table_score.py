@@ -117,14 +117,20 @@ def test_perfect_tracks_of_the_demo_score_one(tmp_path, capsys):
 def test_wrong_files_are_one_sentence(tmp_path, capsys):
     """A table of something else is named, not counted as no tracks."""
     junk = tmp_path / "junk.csv"
-    for text in (
-        "",
-        *(f"frame,x,y,w,h,class\n1,{x},2,3,4,car\n" for x in ("nan", "1e300")),
-        'frame,x,y,w,h,class\n1,1,2,3,4,"' + "car" * 50_000,  # a quotation mark that nothing closes
-        "a,b\n1,2\n",
+    for text, said in (
+        ("", "it has no column x, y, w, h, class"),
+        *(
+            (f"frame,x,y,w,h,class\n1,{x},2,3,4,car\n", "line 2 has no frame, box or class")
+            for x in ("nan", "1e300")
+        ),
+        ("x,y,w,h,class\n1,2,3,4,car\n", "line 2 has no frame"),
+        ("frame,x,y,w,h,class\n1,1,2,3,4\n", "line 2 has no frame, box or class"),
+        # A quotation mark that nothing closes.
+        ('frame,x,y,w,h,class\n1,1,2,3,4,"' + "car" * 50_000, "field larger than field limit"),
+        ("a,b\n1,2\n", "it has no column x"),
     ):
         junk.write_text(text)
-        with pytest.raises(UserError, match=r"junk\.csv is not a table of tracks"):
+        with pytest.raises(UserError, match=rf"junk\.csv is not a table of tracks .*\({said}"):
             read_tracks(junk)
     with pytest.raises(UserError, match=r"junk\.csv, line 1 is 'a,b'"):
         read_truth(junk, class_names=("car",))
