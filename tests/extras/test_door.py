@@ -23,6 +23,7 @@ from hvt_edge.wiring.storing import open_local_copy
 from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import all_extras, config_class, locators
+from hvt_ground.perception.models import ModelFacts
 from hvt_ground.poses import NOWHERE
 from media.onnx_models import colour_classifier, colour_detector
 
@@ -36,6 +37,8 @@ from media.onnx_models import colour_classifier, colour_detector
         (["--terrain", "a.tif"], "terrain"),
         (["--web"], "web"),
         (["--keep", "3days"], "ground"),
+        (["--timing", "a.csv"], "ground"),
+        (["--serve"], "ground"),
     ],
 )
 def test_a_setting_of_an_extra_that_is_absent(words, package):
@@ -154,6 +157,15 @@ def test_a_model_of_the_library_that_is_absent(detector, head, says, monkeypatch
     remedy = r"the model library is an extra that is not installed: pip install 'hvt\[edge\]'"
     with pytest.raises(UserError, match=rf"{re.escape(says)}.*{remedy}"):
         open_detector(detector, head=head)
+
+
+def test_a_detector_that_is_to_read_stills_without_the_library_is_refused_at_the_start(monkeypatch):
+    """The first still would end the session of its edge."""
+    config = GroundConfig(classifier="detector")
+    assert ModelFacts.of(config).redetection is not None
+    monkeypatch.setattr("hvt_common.inference.store.installed", lambda _group: {})
+    with pytest.raises(UserError, match=r"^--classifier detector is not available: "):
+        ModelFacts.of(config)
 
 
 def test_a_model_whose_pixels_only_the_library_knows_is_not_fed_wrong_ones(monkeypatch, tmp_path):
