@@ -6,11 +6,9 @@ so that they never contradict each other. Unknown values are None, never 0.
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from hvt_common import __version__
@@ -35,46 +33,9 @@ _LEAST_OLD_S = 1.5
 """Boxes that are younger do not count as old."""
 _SILENT_S = 3.0
 """A source that has given no frame for this long, and two frames longer, has failed."""
-_ZONES = "sys/class/thermal/thermal_zone*/temp"
-_WIRELESS = "proc/net/wireless"
-_HEAD_LINES = 2
 
 Phase = Literal["waiting", "running", "ended"]
 """``waiting``: a clip waits for its first ground."""
-
-
-@dataclass(frozen=True, slots=True)
-class SystemReading:
-    """The machine's temperature and the quality of its wireless link; None where the system gives none."""
-
-    temperature_c: float | None = None
-    wireless_quality: float | None = None
-    """The driver's count, of 70 with most drivers."""
-    wireless_dbm: float | None = None
-
-
-def read_system(root: Path = Path("/")) -> SystemReading:
-    """Read the present values; ``root`` is the folder of ``sys`` and ``proc``."""
-    quality, level = _wireless(root / _WIRELESS)
-    return SystemReading(_hottest_c(root), quality, level)
-
-
-def _hottest_c(root: Path) -> float | None:
-    hottest: float | None = None
-    for zone in root.glob(_ZONES):
-        with contextlib.suppress(OSError, ValueError):  # a sensor that is switched off answers with an error
-            here = int(zone.read_text(encoding="ascii")) / 1000
-            hottest = here if hottest is None else max(hottest, here)
-    return hottest
-
-
-def _wireless(path: Path) -> tuple[float | None, float | None]:
-    # Quality and level of the first interface (proc(5)): ``wlan0: 0000 54. -56. -256 …``.
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        _, _, rest = path.read_text(encoding="ascii").splitlines()[_HEAD_LINES].partition(":")
-        _, quality, level = (float(one) for one in rest.split()[:3])
-        return quality, level if level < 0 else None  # above, an old driver counts in units of its own
-    return None, None
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +150,6 @@ class EdgeState:
     """Processor cores that all frames would need, had none been left out."""
     cores_free: float | None
     """Cores that other processes leave."""
-    system: SystemReading
     link: LinkState
     backlog: BacklogState | None
     failed: tuple[FailedPart, ...]
@@ -334,7 +294,6 @@ class Heartbeat:
             detection_slow=slow,
             cores_needed=None if cores == Cores() else cores.needed,
             cores_free=None if cores == Cores() else cores.free,
-            system=read_system(),
             link=self._link(now_ns),
             backlog=None if self.backlog is None else _backlog(self.backlog),
             failed=self.failures.now,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import partial
 
 from prometheus_client.core import Metric
@@ -12,6 +13,7 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.report.state import BacklogState, EdgeState
 from hvt_fleet.health import server
 from hvt_fleet.health.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
+from hvt_fleet.health.system import SystemReading, read_system
 
 _GAUGES: Table[EdgeState] = {
     "hvt_budget_bits_per_second": ("The edge's budget.", lambda one: one.operating.budget_bps),
@@ -29,9 +31,11 @@ _GAUGES: Table[EdgeState] = {
     "hvt_edge_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
     "hvt_edge_cores_needed": ("Cores for every frame.", lambda one: one.cores_needed),
     "hvt_edge_cores_free": ("Cores that others leave.", lambda one: one.cores_free),
-    "hvt_edge_temperature_celsius": ("Of the hottest zone.", lambda one: one.system.temperature_c),
-    "hvt_edge_wireless_quality": ("As the driver counts.", lambda one: one.system.wireless_quality),
-    "hvt_edge_wireless_dbm": ("Level of the signal.", lambda one: one.system.wireless_dbm),
+}
+_MACHINE: Table[SystemReading] = {
+    "hvt_edge_temperature_celsius": ("Of the hottest zone.", lambda one: one.temperature_c),
+    "hvt_edge_wireless_quality": ("As the driver counts.", lambda one: one.wireless_quality),
+    "hvt_edge_wireless_dbm": ("Level of the signal.", lambda one: one.wireless_dbm),
 }
 _COUNTERS: Table[EdgeState] = {
     "hvt_edge_frames_captured": ("Of the source.", lambda one: one.frames.account.came),
@@ -66,7 +70,7 @@ def metrics_text(state: EdgeState) -> bytes:
     return exposition(_metrics(state))
 
 
-serve = partial(server.serve, metrics_text)
+serve = partial(server.serve, metrics_text, beside=lambda: {"system": asdict(read_system())})
 
 
 def _metrics(state: EdgeState) -> Iterator[Metric]:
@@ -93,6 +97,7 @@ def _metrics(state: EdgeState) -> Iterator[Metric]:
         groups.add_metric((edge, group), state.frames.account.groups.get(group, 0))
     yield from (sent, failed, not_sent, groups)
     yield from of_table(_GAUGES, Gauge, [(edge, state)])
+    yield from of_table(_MACHINE, Gauge, [(edge, read_system())])
     yield from of_table(_COUNTERS, Counter, [(edge, state)])
     stores = [] if state.backlog is None else [(edge, state.backlog)]
     yield from of_table(_STORE_GAUGES, Gauge, stores)

@@ -61,8 +61,12 @@ def serve(
     stuck_s: float,
     failures: Failures,
     lacks: Callable[[_State], str],
+    beside: Callable[[], dict[str, Any]] = dict,
 ) -> HealthServer:
-    """See `hvt_common.runtime.plug_ins.health_server`; ``metrics_text(state)`` is for Prometheus."""
+    """See `hvt_common.runtime.plug_ins.health_server`; ``metrics_text(state)`` is for Prometheus.
+
+    ``beside()`` has further fields of the state as JSON.
+    """
 
     def of_state(make: Callable[[_State], Answer]) -> Answer:
         state = newest()
@@ -83,7 +87,7 @@ def serve(
     answers = {
         "/metrics": lambda: of_state(lambda state: Answer(metrics_text(state), _METRICS_TYPE)),
         "/state.json": lambda: of_state(
-            lambda state: Answer(json.dumps(state.as_dict()).encode(), "application/json")
+            lambda state: Answer(json.dumps(state.as_dict() | beside()).encode(), "application/json")
         ),
         "/healthz": alive,
         "/readyz": lambda: of_state(lambda state: said(state, ready=True)),
