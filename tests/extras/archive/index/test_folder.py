@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -304,7 +305,7 @@ def test_a_clock_that_is_set_removes_nothing(copied, set_by_s):
 @pytest.mark.parametrize("ahead_s", [2 * YEAR_S, -56 * YEAR_S])
 def test_a_clock_that_is_wrong_after_a_boot_removes_nothing(copied, ahead_s):
     """The clock of a machine without a battery says anything: nobody knows how long it was off."""
-    clock = {
+    clock: dict[str, Any] = {
         "now_ns": lambda: time.time_ns() + round(ahead_s * 1e9),
         "since_boot": lambda: ("the next", since_boot_ns()),
     }
