@@ -19,6 +19,7 @@ MS = 1_000_000
 FRAME_NS = 66_666_667
 STEP_NS = 10 * MS
 REPORT_NS = 150 * MS
+NIGHTLY = partial(pytest.param, marks=pytest.mark.nightly)
 
 
 class Ground:
@@ -165,7 +166,7 @@ def test_a_minute_of_loss_is_as_dark_as_without_a_limit(loss, grounds, takes_ms,
     assert limited.longest_dark_s <= max(1.5, free.longest_dark_s + 0.5)
 
 
-@pytest.mark.parametrize("way_ms", [10, 30, 100, 200])
+@pytest.mark.parametrize("way_ms", [10, NIGHTLY(30), NIGHTLY(100), 200])
 def test_after_a_loss_a_keyframe_comes_at_once_and_only_one(way_ms):
     """Each lost frame would darken the screen for longer than the link needs, or bring keyframe after keyframe."""
     flown = [Minute(LIMITED, loss=0.01, seed=seed, way_ms=way_ms) for seed in range(8)]
@@ -176,8 +177,8 @@ def test_after_a_loss_a_keyframe_comes_at_once_and_only_one(way_ms):
     assert sum(minute.requests.sent for minute in flown) <= losses + 8 * 7
 
 
-@pytest.mark.parametrize("way_ms", [10, 30, 100, 200])
-@pytest.mark.parametrize("loss", [0.01, 0.05, 0.1])
+@pytest.mark.parametrize("way_ms", [10, NIGHTLY(30), NIGHTLY(100), 200])
+@pytest.mark.parametrize("loss", [0.01, NIGHTLY(0.05), 0.1])
 def test_lost_frames_that_go_once_more_leave_less_of_the_screen_dark(loss, way_ms):
     """Each would cost all frames up to the next keyframe, and that the bits of some four."""
     without, repaired = (

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import PrimaryReceiver
 from hvt_edge.link.pacer import Flight, Pacer
 from hvt_edge.link.rate_control import (
@@ -77,7 +76,7 @@ def test_a_fall_to_a_fifth_and_back():
 
 def test_loss_without_a_queue_lowers_the_rate_where_it_is_heavy():
     """A radio that loses one packet in twenty would be taken for a full one, or a policer be flooded for ever."""
-    assert min(flown(60, (0, 1e6), loss=0.05).rate_between(0, 60)) > 600_000
+    assert min(flown(40, (0, 1e6), loss=0.05).rate_between(0, 40)) > 600_000
     heavy = flown(40, (0, 1e6), loss=0.3)
     assert heavy.rates[-1][1] < 600_000
     assert heavy.pacer.backoffs >= 2
@@ -191,7 +190,7 @@ def test_a_route_that_becomes_longer_costs_some_seconds_only():
 @pytest.mark.parametrize("jump_s", [2, -2])
 def test_a_small_clock_step_costs_some_seconds_only(jump_s):
     """It cannot be told from a queue at once, but it would have to be in the end."""
-    flight = flown(80, (0, 1e6), ahead_s=lambda second: 0 if second < 10 else jump_s)
+    flight = flown(60, (0, 1e6), ahead_s=lambda second: 0 if second < 10 else jump_s)
     assert flight.rates[-1][1] == 800_000
 
 
@@ -396,26 +395,6 @@ def test_one_report_cannot_do_more_than_its_share():
         said = progress(number * 150 * MS, number * 10_000, delay_ns=delay_ns, serialization_ns=50 * MS)
         steered.on_progress(said)
     assert steered.rate_bps == 800_000
-
-
-def test_the_budget_takes_another_total_at_once():
-    """What the link does not carry any more would still be sent."""
-    budget = RollingBudget(BudgetSettings(total_bps=800_000, base_bps=400_000, fps=10))
-    for frame in range(20):
-        budget.record_base(5_000, now_ns=frame * 100 * MS)
-    now_ns = 2 * S
-    assert budget.still_allowance(now_ns) > 0
-    budget.set_total(440_000, 400_000, 10, now_ns=now_ns)
-    assert 0 < budget.still_allowance(now_ns) <= 5_000
-    budget.set_total(200_000, 400_000, 10, now_ns=now_ns)
-    assert budget.still_allowance(now_ns) == 0
-    at_ns, sent_bytes = now_ns, 0
-    while (at_ns := budget.earliest_ns(5_000, now_ns=at_ns, base=True)) < now_ns + S:
-        budget.record_base(5_000, now_ns=at_ns)
-        sent_bytes += 5_000
-    assert 20_000 <= sent_bytes <= 25_000
-    budget.set_total(800_000, 160_000, 5, now_ns=now_ns)
-    assert budget.base_step_bytes == 4_000
 
 
 def test_few_frames_where_x265_can_do_no_more():

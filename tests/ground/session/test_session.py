@@ -17,7 +17,6 @@ from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
 from hvt_ground.events import Event, Refinement
 from hvt_ground.perception.models import DetectorThread
-from hvt_ground.perception.worker import LockstepWorker
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -180,25 +179,6 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         assert rig.receiver.receiver.unusable == 3
         rig.take(*bases(flight, *range(4, 10)), flight.status(base=10))
         assert session.reception.analyzed[0] == 9
-
-
-def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
-    """One lost message would freeze the picture, or fill it with garbage that looks like a picture."""
-    with Rig(flight) as rig:
-        rig.take(*bases(flight, 0, 1, 2, *range(5, 14)))
-        session = rig.session
-        assert session.frames_decoded == 3
-        eventually(lambda: rig.port.keyframe_requests >= 1)
-        rig.take(*bases(flight, *range(14, 30)))
-        assert session.frames_decoded == 3 + 10
-        assert session.reception.frames == 28
-        assert session.reception.analyzed[0] == 29
-        requested = rig.port.keyframe_requests
-        time.sleep(0.4)
-        assert rig.port.keyframe_requests == requested, "what is shown again is not asked for"
-    content = summary(rig.ended[0])
-    assert (content["gaps"], content["lost"], content["keyframe_requests"]) == (1, 2, requested)
-    assert (content["frames"], content["frames_decoded"]) == (28, 13)
 
 
 def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
@@ -525,16 +505,6 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
         eventually(lambda: len(rig.reader.had_base) == 20)
         assert all(rig.reader.had_base)
         assert rig.session.perceived.refined >= 1  # a busy machine may lose the track between
-
-
-def test_a_still_before_its_frame_waits_for_its_track(flight):
-    """On two links stills overtake pictures: they would refine nothing."""
-    in_order = partial(LockstepWorker, name="uav-1")  # a busy machine would pass frames over
-    with Rig(flight, worker_of=in_order) as rig:
-        rig.take(*bases(flight, 0, 1, 2), flight.still(6, 0))
-        assert rig.session.perceived.refined == 0
-        rig.take(*bases(flight, *range(3, 12)))
-        eventually(lambda: rig.session.perceived.refined == 1)
 
 
 def test_lockstep_sees_every_frame_and_answers_every_still():
