@@ -126,14 +126,9 @@ class SessionState:
     fps: float = _of(lambda at: at.session.info.fps)
     budget_bps: int = _of(lambda at: at.session.reception.budget_bps)
     """As it is now, like the method; a command shows within half a minute."""
-    mean_bps: int = _of(
-        lambda at: at.session.reception.ledger.mean_bps(
-            max(at.session.reception.duration_s, at.session.info.window_ns / SECOND_NS)
-        )
-    )
-    """Over the session and at least the budget's window, all that crossed the line."""
     total_bps: float | None = _live(lambda _, now: now.total_bps)
-    """Over the budget's window, like the two below; None while no picture comes, like all that is of now."""
+    """Over the budget's window, all that crossed the line, like the two below; None while no picture comes, like all
+    that is of now."""
     budget_share: float | None = _live(lambda one, now: now.total_bps / one.reception.budget_bps)
     """The same as a share of the budget."""
     base_bps: float | None = _live(lambda _, now: now.base_bps)

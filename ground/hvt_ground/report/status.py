@@ -14,12 +14,20 @@ from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink, Sink
 
+_MOST_ENDED = 3
+
 
 def status_text(state: GroundState) -> str:
-    """The status line: the traffic of each edge now, and the failed parts; empty without any."""
+    """The status line: the traffic of each edge now, and the failed parts; empty without any.
+
+    Edges that have ended stand behind the others; more than a few are counted.
+    """
+    ended = [one for one in state.edges if one.link == "ended" and one.session is None and not one.failed]
+    edges = [_edge_text(one) for one in state.edges if one not in ended]
+    edges += map(_edge_text, ended) if len(ended) <= _MOST_ENDED else [f"{len(ended)} edges ended"]
     elsewhere = [f"{edge}: at {one.member}" for edge, one in state.elsewhere.items()]
     loading = ["detector loading"] * state.loading
-    return " | ".join([*map(_edge_text, state.edges), *elsewhere, *loading, *map(failed_text, state.failed)])
+    return " | ".join([*edges, *elsewhere, *loading, *map(failed_text, state.failed)])
 
 
 def _edge_text(one: EdgeState) -> str:
@@ -33,8 +41,9 @@ def _edge_text(one: EdgeState) -> str:
         not_sent = session.stills_not_sent
         why = f" (not sent: {counts_text(not_sent, most=2)})" if not_sent else ""
         age = "" if session.delay_p50_ms is None else f"  {session.delay_p50_ms:.0f} ms"
-        rate = f"{bitrate_text(session.mean_bps)} of {bitrate_text(session.budget_bps)}"
-        if session.total_bps is None:
+        if session.total_bps is not None:
+            rate = f"{bitrate_text(round(session.total_bps))} of {bitrate_text(session.budget_bps)}"
+        else:
             since = "" if session.picture_age_s is None else f" for {session.picture_age_s:.0f} s"
             rate = f"NO PICTURE{since}"
         said = (
