@@ -8,6 +8,9 @@ fall over several reports (as in CoDel, a burst empties, a standing queue does n
 of the arrival rate meanwhile, which is the link's capacity. Messages sent before that say nothing about the new rate
 and are not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
 
+A delay that stays high but is the same for small and large messages is no queue's: the route has become longer, and
+its new delay is the least from then on.
+
 Growth follows a cubic curve (RFC 9438, section 4.2, in time): quickly back to the rate of the last breakdown, long
 near it, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and the rate of a
 link that has come back is found again in some seconds.
@@ -57,6 +60,12 @@ _MOST_LOSS = 0.12
 """Share of lost messages; less counts as the link's nature, and only slows growth down."""
 _MEMORY_NS = 15 * SECOND_NS
 """Window of the least delay: a route that became longer does not count as a queue for ever."""
+_ROUTE_NS, _ROUTE_REPORTS = 2 * SECOND_NS, 8
+"""A delay that was high for this time, over so many reports, is that of a longer route, …"""
+_SAME_NS, _VARIED_NS = 20 * _MS, 40 * _MS
+"""… if it varied no more than the first, and a queue's would have varied more than the second."""
+_ROUTE_FALL = 4
+"""After it the rate goes on at this part of the rate before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +188,8 @@ class RateController:
         self._base_ns: int | None = None
         self._recent: deque[tuple[Progress, int]] = deque(maxlen=64)
         """Reports that were judged, and their excess (ns)."""
+        self._former_bps = self._rate
+        """The rate from which it fell, before it was on its way back."""
         self._judge_from_ns = -(2**63)
         """Only messages sent after this time say something about the present rate."""
         self._cubic_max = self._low = float(ceiling_bps)
@@ -224,7 +235,9 @@ class RateController:
         self._recent.append((progress, excess_ns))
         self._losses.add(progress.messages, progress.lost)
         limit_ns = self._limit_ns()
-        if self._overused(limit_ns):
+        if excess_ns >= limit_ns // 2 and self._is_longer_route():
+            self._take_longer_route()
+        elif self._overused(limit_ns) and self._rate > self._floor_bps:
             self._back_off(progress, _BACKOFF * min(self._rate, self._arriving_bps()))
         elif self._losses.exceeds():
             if progress.now_ns >= self._next_loss_ns and self._losses.lasts():
@@ -288,6 +301,28 @@ class RateController:
             return False
         return excesses_ns[-1] >= excesses_ns[0] - limit_ns // 4  # else the queue empties: wait
 
+    def _is_longer_route(self) -> bool:
+        # Behind a queue, each message waits for those before it. A delay that is the same for small and large ones,
+        # and stays as it is at a lower rate, is the route's.
+        newest = self._recent[-1][0]
+        delays_ns, queued_ns = [], []
+        for one, _ in reversed(self._recent):
+            delays_ns.append(one.arrived_ns - one.sent_ns)
+            queued_ns.append(one.serialization_ns)
+            if max(delays_ns) - min(delays_ns) > _SAME_NS:
+                return False
+            if len(delays_ns) >= _ROUTE_REPORTS and newest.arrived_ns - one.arrived_ns >= _ROUTE_NS:
+                return max(queued_ns) - min(queued_ns) >= _VARIED_NS
+        return False
+
+    def _take_longer_route(self) -> None:
+        # Its delay is the least from now on; the former rate is found again as after a silence. The little that is
+        # sent meanwhile would prove a higher rate but slowly.
+        self.forget_path()
+        self._cubic_max = max(self._rate, self._former_bps)
+        self._rate = self._low = max(self._rate, self._former_bps / _ROUTE_FALL)
+        self._curve_ns, self._plateau_ns = 0, _RESUME_NS
+
     def _arriving_bps(self) -> float:
         # The arrival rate while the queue stood: the link's capacity.
         chosen = self._verdict() or list(self._recent)
@@ -295,6 +330,8 @@ class RateController:
 
     def _back_off(self, progress: Progress, rate: float) -> None:
         broke_bps = min(self._rate, self._arriving_bps())
+        if self._curve_ns >= self._plateau_ns:
+            self._former_bps = self._rate
         again = 0.85 * self._cubic_max < broke_bps < 1.15 * self._cubic_max
         self._rate = max(rate, self._rate / 10, self._floor_bps)
         self._cubic_max, self._low, self._curve_ns = max(self._rate, broke_bps), self._rate, 0

@@ -180,18 +180,19 @@ def test_what_was_never_sent_proves_nothing():
     assert 150_000 < steered.rate_bps <= 200_000  # 80 kbps arrive
 
 
-def test_a_route_that_becomes_longer_costs_some_seconds_only():
-    """After a hand-over to a satellite the edge would stay at its least for good."""
-    flight = flown(75, (0, 1e6), way_s=lambda second: 0.02 if second < 15 else 0.32)
-    assert len([second for second in flight.sent if second > 21]) > 750  # of 810
-    assert min(flight.rate_between(60, 75)) == 800_000
+@pytest.mark.parametrize("way_s", [0.32, 1.02])
+def test_a_route_that_becomes_longer_costs_some_seconds_only(way_s):
+    """After a hand-over to a satellite the edge would stay at its least for good, or for most of a minute."""
+    flight = flown(60, (0, 1e6), way_s=lambda second: 0.02 if second < 15 else way_s)
+    assert len([second for second in flight.sent if second > 21]) > 550  # of 585
+    assert min(flight.rate_between(34, 60)) == 800_000
 
 
 @pytest.mark.parametrize("jump_s", [2, -2])
 def test_a_small_clock_step_costs_some_seconds_only(jump_s):
     """It cannot be told from a queue at once, but it would have to be in the end."""
-    flight = flown(60, (0, 1e6), ahead_s=lambda second: 0 if second < 10 else jump_s)
-    assert flight.rates[-1][1] == 800_000
+    flight = flown(45, (0, 1e6), ahead_s=lambda second: 0 if second < 10 else jump_s)
+    assert min(flight.rate_between(30, 45)) == 800_000
 
 
 def honest(pacer: Pacer, primary: PrimaryReceiver, *, now_ns: int, sequence: int, seconds: int) -> None:
