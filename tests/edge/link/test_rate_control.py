@@ -255,14 +255,87 @@ def test_absurd_reports_keep_the_rate_within_its_bounds(reports):
     assert pacer.rate_bps >= 0.9 * 800_000
 
 
+def reported() -> Pacer:
+    # To which a ground has reported that nothing came.
+    pacer = Pacer(controller())
+    pacer.on_report(counted(feedback(base_sequence=-1), now_ns=0, first=True))
+    return pacer
+
+
+@pytest.mark.parametrize(
+    ("waits_ms", "still", "frame"),
+    [(49, True, True), (60, False, True), (240, False, True), (260, False, False)],
+)
+def test_a_still_waits_for_little_and_a_frame_for_a_quarter_of_a_second(waits_ms, still, frame):
+    """Stills would stand before each frame, and frames of a second in a queue of the edge's own."""
+    size = waits_ms * 100  # at 800 kbps
+    for send in (
+        lambda pacer: pacer.sent_base(0, size, now_ns=0),
+        lambda pacer: pacer.sent_still(0, size, now_ns=0),
+        lambda pacer: pacer.sent_other(size, now_ns=0),
+    ):
+        send(pacer := reported())
+        assert (pacer.admits_still(0), pacer.admits_base(0)) == (still, frame)
+        assert pacer.admits_base(0, coding_ns=20 * MS), "it will be coded by then"
+        assert pacer.admits_still((waits_ms - 40) * MS)
+
+
+def test_what_a_report_names_waits_no_more():
+    """A link faster than its rate would stay empty until the edge's own count has run down."""
+    pacer = reported()
+    pacer.sent_still(0, 30_000, now_ns=0)
+    assert not pacer.admits_base(10 * MS)
+    pacer.on_report(counted(feedback(sequence=1, base_sequence=-1, still_sequence=0), now_ns=10 * MS))
+    assert pacer.admits_still(10 * MS)
+
+
+def test_where_the_rate_falls_all_that_is_not_reported_still_waits():
+    """The link has carried less than was counted: what is sent next would lengthen its queue."""
+    pacer, number, admitted = reported(), 0, True
+    while not pacer.backoffs:
+        number, now_ns = number + 1, number * 50 * MS
+        pacer.sent_base(number, 4_000, now_ns=now_ns)
+        come, now_ns = number - 3 * (number > 20), now_ns + 45 * MS
+        admitted = pacer.admits_still(now_ns)
+        said = feedback(sequence=number, base_sequence=come, send_ns=now_ns - 15 * MS)
+        pacer.on_report(counted(said, now_ns=now_ns))
+    assert admitted
+    assert not pacer.admits_still(now_ns)
+
+
+@pytest.mark.parametrize("silent_s", [1, 3])
+def test_after_a_silence_nothing_is_waited_for(silent_s):
+    """At the least rate, what was under way would keep live video away for a second more."""
+    pacer = Pacer(controller())
+    honest(pacer, PrimaryReceiver(), now_ns=0, sequence=-1, seconds=5)
+    for number in range(75, 79):
+        pacer.sent_base(number, 6_000, now_ns=5 * S)
+    now_ns = (5 + silent_s) * S
+    pacer.on_report(counted(feedback(sequence=500, base_sequence=75), now_ns=now_ns))
+    assert pacer.admits_base(now_ns) is (silent_s == 3)
+
+
+def test_a_queue_that_builds_up_slowly_is_none_of_the_route():
+    """The least delay of the last seconds would rise with it, and the picture become seconds old unseen."""
+    steered = controller()
+    for number in range(100):
+        late_ns = (20 + 2 * number) * MS
+        steered.on_progress(progress(number * 150 * MS, number * 15_000, delay_ns=late_ns))
+    assert steered.backoffs
+
+
 def test_a_number_that_was_never_sent_acknowledges_nothing():
     """A forged report would open the gate while the link is full."""
     flight = Flight()
     flight.sent(5_000, now_ns=0, rate_bps=800_000, base=0)
-    assert flight.acknowledge(1, -1) is None
+    assert flight.acknowledge(1, -1) is flight.acknowledge(0, 0) is None
     assert flight.size_bytes == 5_000
+    flight.sent(7_000, now_ns=0, rate_bps=800_000, still=0)
     assert flight.acknowledge(0, -1) is not None
-    assert flight.size_bytes == 0
+    assert flight.size_bytes == 7_000
+    flight.sent(5_000, now_ns=3 * S, rate_bps=800_000, base=1)
+    assert flight.acknowledge(1, -1) is not None
+    assert flight.size_bytes == 0, "the still is lost"
 
 
 def test_what_is_on_its_way_is_bounded():

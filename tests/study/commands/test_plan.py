@@ -14,7 +14,7 @@ from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs, parse_regimes
 from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.runs.methods import chosen_methods
-from hvt_study.runs.run_settings import edge_flags
+from hvt_study.runs.run_settings import edge_flags, settings
 from hvt_study.runs.spec import ModelChoice
 from hvt_study.runs.video_shape import VideoShape
 from studies.layouts import write_visdrone
@@ -132,6 +132,9 @@ def test_parameters_are_those_of_the_runs(tmp_path):
     assert [flags[at + 1] for at, flag in enumerate(flags) if flag == "--tune"] == list(tuned.tune)
     (video,) = matched_runs(plan, tuned, {"failed": "", "total_bps": 250_000})
     assert (video.method, video.target.total_bps, video.tune) == ("M0", 250_000, ())
+    peer = first_runs(plan_of("DDS"))[0]
+    used = settings(peer, None, budget_bps=300_000, shape=VideoShape(5), named=peer.models)
+    assert used["DDS"]["fps"] == 5
     usual = METHODS["M5"].parameters
     assert tuned_methods([f"M5:{name}={value!r}" for name, value in usual.items()]) == {}, "M5 as it is"
 

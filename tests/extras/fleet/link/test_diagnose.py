@@ -162,6 +162,18 @@ def test_a_ca_that_has_ended_is_not_the_reason(
     assert "TLS works, both certificates are in order, but no Zenoh link comes of it" in said
 
 
+def test_who_asks_with_keys_of_another_fleet_is_told(fleet: Fleet, tmp_path: Path, free_port: int) -> None:
+    """'Nobody answers' would be said of a ground that runs."""
+    other, where = Fleet(tmp_path / "other"), (f"tls/127.0.0.1:{free_port}",)
+    other.keys("add-ground", "base")
+    with (
+        open_session(fleet.settings("base", "ground", listen=where)),
+        pytest.raises(UserError, match=r"^no link: tls/.*: its certificate was not signed by the CA in"),
+        open_session(LinkSettings("client", connect=where, zenoh_config=other.file("base"))),
+    ):
+        pass
+
+
 # The watch
 
 
