@@ -22,6 +22,7 @@ from hvt_study.datasets.annotation_rows import Rows, read_rows
 from hvt_study.datasets.labels import (
     NO_ID,
     FrameLabels,
+    LabelDoubts,
     check_inside,
     check_pixels,
     covered_share,
@@ -62,6 +63,8 @@ class LabelTable:
     ignored: Regions
     paired: bool = False
     """Of `FrameLabels`."""
+    one_target: bool = False
+    """One object is labelled, and nothing else that is in view."""
 
     @classmethod
     def of(
@@ -78,11 +81,12 @@ class LabelTable:
         """Those rows that are ``judged``, cut at the frame of this (width, height); empty ones are left out.
 
         A number below 0, or of two objects of a frame, as where all have 0, says nothing of who is who. Raises
-        `UserError` where many lie outside the frame.
+        `UserError` where many of a sequence lie outside the frame; of one picture nobody knows how many are many.
         """
         check_pixels(rows.path, [rows[side] for side in "xywh"])
         frames, boxes = rows["frame"].astype(np.int64), rows.boxes(origin=origin)
-        check_inside(rows.path, boxes[judged], size)
+        if "frame" in rows.columns:
+            check_inside(rows.path, boxes[judged], size)
         boxes = inside_frame(boxes, size)
         regions = inside_frame(ignored.boxes, size)
         places = _rows_with_area(ignored.frames, regions)
@@ -172,25 +176,31 @@ _OBJECT = "x,y,w,h,score,category,truncation,occlusion"
 _REGION, _OTHERS = 0, 11
 
 
-def image_labels(path: Path, size: tuple[int, int]) -> FrameLabels:
+def image_labels(path: Path, size: tuple[int, int], doubts: LabelDoubts) -> FrameLabels:
     """Labels of one image of this (width, height); wrong rows are left out. `UserError` where all are."""
-    table = _table(read_rows(path, columns=_OBJECT, least=6, frames=False, of_dataset=True), size)
-    return table.at(-1)  # the value of a column that the file does not have
+    rows, judged = _judged(read_rows(path, columns=_OBJECT, least=6, frames=False, of_dataset=True))
+    wheres = [f"{path}, line {number}" for number in rows.lines[judged].tolist()]
+    doubts.good += len(doubts.inside(rows.boxes()[judged].astype(np.float64), size, wheres)[1])
+    return _table(rows, judged, size).at(-1)  # the value of a column that the file does not have
 
 
 def video_table(path: Path, size: tuple[int, int]) -> LabelTable:
     """Labels of pictures of this (width, height); wrong rows are left out. `UserError` where all are."""
-    return _table(read_rows(path, columns=f"frame,id,{_OBJECT}", least=10, of_dataset=True), size)
+    return _table(*_judged(read_rows(path, columns=f"frame,id,{_OBJECT}", least=10, of_dataset=True)), size)
 
 
-def _table(rows: Rows, size: tuple[int, int]) -> LabelTable:
-    """Wanted objects, and unwanted ones: regions, and single objects ("others", and those of score 0)."""
+def _judged(rows: Rows) -> tuple[Rows, npt.NDArray[np.bool_]]:
+    """Rows of a known category, and which are wanted: no regions, no "others", and none of score 0."""
     column = rows.columns.index("category") + 1
     rows = rows.only(
         np.isin(rows["category"], np.arange(_OTHERS + 1)),
         accepted=f"a category from 0 to {_OTHERS} in column {column}",
     )
     category = rows["category"].astype(np.int64)
-    judged = (category >= 1) & (category <= len(VISDRONE_NAMES)) & (rows["score"] != 0)
+    return rows, (category >= 1) & (category <= len(VISDRONE_NAMES)) & (rows["score"] != 0)
+
+
+def _table(rows: Rows, judged: npt.NDArray[np.bool_], size: tuple[int, int]) -> LabelTable:
+    category = rows["category"].astype(np.int64)
     ignored = Regions.of(rows, ~judged, category == _REGION)
     return LabelTable.of(rows, judged, category - 1, VISDRONE_NAMES, ignored=ignored, size=size)

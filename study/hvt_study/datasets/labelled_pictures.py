@@ -68,7 +68,7 @@ class LabelledPicture:
             return self.labels
         if isinstance(self.labels, Path):
             if self.visdrone:
-                return image_labels(self.labels, size)
+                return image_labels(self.labels, size, self.doubts)
             return label_files.read_yolo(
                 self.labels, self.class_names, size, self.doubts, keypoints=self.keypoints
             )

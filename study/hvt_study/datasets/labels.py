@@ -108,21 +108,10 @@ class LabelDoubts:
         `IGNORED` stand beside: in COCO and VOC objects in front of them count.
         """
         names, boxes, wheres = zip(*rows, strict=True) if rows else ((), (), ())
-        corners = np.array(boxes, np.float64).reshape(-1, 4) * (scale * 2)
-        limits = np.array([*size, *size], np.float64)
-        inside = np.clip(corners, 0, limits)
-        beyond = np.abs(corners - inside).max(axis=1, initial=0)
-        solid = np.asarray((inside[:, 2:] > inside[:, :2]).all(axis=1), np.bool_)
-        for row in np.flatnonzero(solid & (beyond > _NOTICED_PX)).tolist():
-            self._clipped += 1
-            self._worst = max(self._worst, (float(beyond[row]), wheres[row]))
+        inside, solid = self.inside(np.array(boxes, np.float64).reshape(-1, 4) * (scale * 2), size, wheres)
         once: dict[tuple[str, *tuple[float, ...]], int] = {}
-        for row in range(len(names)):
-            if not solid[row]:
-                self.leave_out(
-                    f"{wheres[row]} has a box outside the picture of {size[0]}x{size[1]}, or without area"
-                )
-            elif once.setdefault((names[row], *inside[row].tolist()), row) != row:
+        for row in solid.tolist():
+            if once.setdefault((names[row], *inside[row].tolist()), row) != row:
                 self.leave_out(f"{wheres[row]} stands there twice")
         self.good += len(once)
         found = inside[list(once.values())].astype(np.float32)
@@ -130,6 +119,22 @@ class LabelDoubts:
         passed = np.array([name.casefold() in IGNORED for name in kinds], bool)
         judged = [name for name, skip in zip(kinds, passed, strict=True) if not skip]
         return FrameLabels.plain(found[~passed], judged, beside=found[passed])
+
+    def inside(
+        self, boxes: npt.NDArray[np.float64], size: tuple[int, int], wheres: Sequence[str]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.intp]]:
+        """(N, 4) boxes cut at a picture of this (width, height), and the rows with an area inside it."""
+        inside = np.clip(boxes, 0, np.array([*size, *size], np.float64))
+        beyond = np.abs(boxes - inside).max(axis=1, initial=0)
+        solid = (inside[:, 2:] > inside[:, :2]).all(axis=1)
+        for row in np.flatnonzero(solid & (beyond > _NOTICED_PX)).tolist():
+            self._clipped += 1
+            self._worst = max(self._worst, (float(beyond[row]), wheres[row]))
+        for row in np.flatnonzero(~solid).tolist():
+            self.leave_out(
+                f"{wheres[row]} has a box outside the picture of {size[0]}x{size[1]}, or without area"
+            )
+        return inside, np.flatnonzero(solid)
 
     def sentences(self) -> list[str]:
         said = []
@@ -163,7 +168,11 @@ def check_pixels(path: Path, numbers: npt.ArrayLike) -> None:
 
 
 def check_inside(path: Path, boxes: Boxes, size: tuple[int, int]) -> None:
-    """Raise `UserError` where boxes of a file lie outside its pictures of (width, height): others were labelled."""
+    """Raise `UserError` where boxes of a file lie outside its pictures of (width, height): others were labelled.
+
+    Boxes without an area say that the object is not there.
+    """
+    boxes = boxes[(boxes[:, 2:] > boxes[:, :2]).all(axis=1)]
     centres = (boxes[:, :2] + boxes[:, 2:]) / 2
     outside = ((centres < 0) | (centres > size)).any(axis=1).sum()
     if outside > _MOST_OUTSIDE * len(boxes):

@@ -112,12 +112,14 @@ def read_annotations(
     ``classes`` are names of YOLO's; none: those of ``classes.txt`` beside its folder. Wrong rows are left out;
     `UserError` where all are.
     """
-    if path.parent.name.lower() != _YOLO:
-        return image_labels(path, size), tuple(sorted(VISDRONE_NAMES))
-    root = path.parent.parent
-    names = yolo_names(root, tuple(classes) or None)
     doubts = LabelDoubts()
-    found = read_yolo(path, names, size, doubts, keypoints=keypoint_columns(class_file(root, [])))
+    names: Sequence[str] = VISDRONE_NAMES
+    if path.parent.name.lower() != _YOLO:
+        found = image_labels(path, size, doubts)
+    else:
+        root = path.parent.parent
+        names = yolo_names(root, tuple(classes) or None)
+        found = read_yolo(path, names, size, doubts, keypoints=keypoint_columns(class_file(root, [])))
     for sentence in doubts.sentences():
         _log.warning("%s", sentence)
     return found, tuple(sorted({name for name in names if name.casefold() not in IGNORED}))

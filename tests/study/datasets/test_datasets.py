@@ -2,11 +2,13 @@
 
 import pickle
 import shutil
+from contextlib import nullcontext
 
 import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from hvt_common.errors import UserError
 from hvt_scene import Scene
@@ -145,6 +147,32 @@ def test_labels_of_larger_or_turned_pictures_are_refused(tmp_path, scheme):
         UserError, match=r"boxes outside its pictures of 12x20: put the pictures back that were"
     ):
         open_dataset(f"{scheme}:{tmp_path}")
+
+
+IN, OUT, ABSENT = "141,11,9,9", "241,11,9,9", "0,0,0,0"
+
+
+@pytest.mark.parametrize(
+    ("boxes", "turned", "refused"),
+    [
+        ([*[IN] * 9, OUT], 1, False),
+        ([*[IN] * 8, OUT], 1, True),
+        ([IN, *[ABSENT] * 9], 1, False),
+        ([*[IN] * 8, OUT, *[ABSENT] * 9], 1, True),
+        ([IN], 6, True),
+    ],
+)
+def test_more_than_a_tenth_of_boxes_outside_tells_of_other_pictures(tmp_path, boxes, turned, refused):
+    """Objects that leave the picture, or are absent, are no fault; and a turn is in no file of labels."""
+    rows = "".join(f"{1 + number % 6},{number},{box},1,1,1\n" for number, box in enumerate(boxes, start=1))
+    write_mot(tmp_path / "a", rows=rows)
+    tags = Image.Exif()
+    tags[0x0112] = turned
+    for file in tmp_path.rglob("*.png"):
+        Image.open(file).save(file.with_suffix(".jpg"), exif=tags)
+        file.unlink()
+    with pytest.raises(UserError, match="boxes outside its pictures") if refused else nullcontext():
+        assert open_dataset(f"mot:{tmp_path}")[0].labels is not None
 
 
 A = "sequences/a"

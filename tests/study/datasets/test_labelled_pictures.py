@@ -380,6 +380,7 @@ def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
 
 
 XML_OBJECT = voc()[voc().index("<object>") :]
+VISDRONE = "{},10,60,50,1,9,0,0\n"
 LEFT_OUT = {
     "a class beyond the last": (
         {"a.txt": ROW + ROW.replace("1", "2", 1) + ROW.replace("1", "0", 1), "classes.txt": CLASSES},
@@ -401,6 +402,16 @@ LEFT_OUT = {
         1,
         None,
     ),
+    "VisDrone's, outside": (
+        {"a.txt": VISDRONE.format(20) + VISDRONE.format(500)},
+        1,
+        "1 labels were left out; the first: {}, line 2 has a box outside the picture of 200x100",
+    ),
+    "VisDrone's, partly outside": (
+        {"a.txt": VISDRONE.format(20) + VISDRONE.format(150)},
+        2,
+        "1 labels end outside their picture and were cut; the worst is {}, line 2, by 10 px",
+    ),
     "a picture that COCO names twice is one": ({"coco.json": coco(change=twice)}, 2, None),
 }
 
@@ -414,7 +425,7 @@ def test_a_row_that_is_none_is_left_out_with_a_word(tmp_path, case):
     assert len(labels) == count
     assert "bus" in labels.class_names
     said = doubts_of([one])
-    assert words in said[0] if words else said == []
+    assert words.format(tmp_path / "a.txt") in said[0] if words else said == []
 
 
 def test_what_coco_says_of_classes_and_crowds_counts(tmp_path):
