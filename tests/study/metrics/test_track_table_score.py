@@ -9,8 +9,10 @@ from hvt_ground.events import Notice, Overlay
 from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_study.datasets.labels import FrameLabels
+from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.metrics.judged import FrameView
 from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
+from studies.layouts import write_mot
 
 AREA_PX = 1280 * 720
 
@@ -180,8 +182,12 @@ def test_of_one_target_nothing_is_said_to_be_false(tmp_path, capsys):
     """Every other car that the ground shows was a false object, and named F1 .1 where the target was always found."""
     for truth, whole in (
         (b"1,1,11,11,50,30,1,1,1\n", False),
+        (b"1,1,11,11,50,30,1,1,1\n2,1,1,1,9,9,0,1,1\n", False),
         (b"1,1,11,11,50,30,1,1,1\n1,2,1,1,9,9,0,1,1\n", True),
+        (b"1,0,11,11,50,30,1,1,1\n1,0,1,1,9,9,0,1,1\n", True),
     ):
+        write_mot(tmp_path / "a", rows=truth.decode())
+        assert open_dataset(f"mot:{tmp_path / 'a'}")[0].one_target != whole, "mot: and score go by one rule"
         code, table, _ = scored(tmp_path, capsys, truth, "--classes", "pedestrian")
         assert (code, "│ found (recall at IoU 0.5)           │ 1.000 │" in table) == (0, True)
         assert ("named F1" in table, "recall alone can be said" in table) == (whole, not whole)

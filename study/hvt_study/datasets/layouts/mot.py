@@ -24,7 +24,6 @@ from collections.abc import Sequence as Names
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -93,7 +92,7 @@ def mot_table(
         kinds = np.searchsorted(used, kinds) + 1
     ignored = Regions.of(rows, passed, np.zeros(len(rows), np.bool_), origin=1.0)
     table = LabelTable.of(rows, judged, kinds - 1, class_names, ignored=ignored, size=size, origin=1.0)
-    return replace(table, paired=not own)
+    return replace(table, paired=not own, one_target=_one_target(rows))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +108,7 @@ class TruthRows:
     classless: bool
     """MOT15's ten columns, which name no class: all are of the only name that was given, else pedestrians."""
     one_target: bool
-    """One object is labelled, and nothing else that is in view."""
+    """Of `LabelTable`."""
 
 
 def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
@@ -129,8 +128,8 @@ def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
     if not classless:
         share = rows["visibility"]
         judged &= (share >= _LEAST_VISIBLE) | (share < 0)  # -1 where the file does not say
-    alone = _one_target(rows["frame"], rows["id"]) and bool((rows["counts"] != 0).all())
-    return TruthRows(rows["frame"].astype(np.int64), rows.boxes(origin=1.0), words, judged, classless, alone)
+    frames, alone = rows["frame"].astype(np.int64), _one_target(rows)
+    return TruthRows(frames, rows.boxes(origin=1.0), words, judged, classless, alone)
 
 
 def _class_text(highest: int) -> str:
@@ -172,17 +171,13 @@ def _open(name: str, folder: Path, options: Options) -> Sequence:
     fps = options.fps or _rate(about, said)
     labels = _labels(folder, said, images) if options.annotated else None
     sequence = images.sequence(name=name, dataset="mot", fps=fps, labels=labels)
-    if labels is None:
-        return sequence
-    table = labels.table()
-    alone = _one_target(table.frames, table.ids) and not len(table.ignored.frames)
-    return replace(sequence, one_target=alone)
+    return sequence if labels is None else replace(sequence, one_target=labels.table().one_target)
 
 
-def _one_target(frames: npt.NDArray[Any], ids: npt.NDArray[Any]) -> bool:
-    """Whether it is a single-object set, where all count: one id, once a frame."""
-    once = len(np.unique(frames)) == len(frames)
-    return once and len(np.unique(ids)) == 1 and bool(ids[0] >= 0)
+def _one_target(rows: Rows) -> bool:
+    """Whether it is a single-object set: all rows are of one id, once a frame, also those that do not count."""
+    once = len(np.unique(rows["frame"])) == len(rows)
+    return once and len(np.unique(rows["id"])) == 1 and bool(rows["id"][0] >= 0)
 
 
 def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
