@@ -67,14 +67,14 @@ class Folders:
         try:
             if path.exists():
                 return path
-        except OSError:  # the name is too long for any file
+            above = None if path.parent == path else path.parent
+            folder = above if above is None or above.is_dir() else self.find(above)
+            if folder is None or not folder.is_dir():
+                return None
+            if folder not in self._names:
+                self._names[folder] = {_plain(one.name): one.name for one in folder.iterdir()}
+        except OSError:  # the name is too long for any file, or the folder may not be read
             return None
-        above = None if path.parent == path else path.parent
-        folder = above if above is None or above.is_dir() else self.find(above)
-        if folder is None or not folder.is_dir():
-            return None
-        if folder not in self._names:
-            self._names[folder] = {_plain(one.name): one.name for one in folder.iterdir()}
         name = self._names[folder].get(_plain(path.name))
         return None if name is None else folder / name
 

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_edge.wiring import default_size
 from hvt_study.datasets.label_files import in_any_case
 from hvt_study.datasets.layouts.uri import open_dataset
@@ -173,8 +173,21 @@ def _shapes(spec: RunSpec) -> tuple[bool, int]:
 
 
 def opened(plan: ComparePlan) -> tuple[str, Sequence]:
-    """The clip as a dataset of one sequence."""
+    """The clip as a dataset of one sequence; `UserError` where it cannot be used."""
     clip = plan.clip
+    with telling(f"clip {clip!r} cannot be read (", "): name another"):
+        uri, options = _located(clip)
+    options |= _label_options(plan, uri)
+    if options:
+        uri += "?" + "&".join(f"{name}={value}" for name, value in options.items())
+    found = open_dataset(uri, limit=2)
+    if len(found) > 1:
+        raise UserError(f"clip {clip} holds several videos: give one of them")
+    return uri, found[0]
+
+
+def _located(clip: str) -> tuple[str, dict[str, str]]:
+    """The clip's dataset, and the options of a picture's camera."""
     options: dict[str, str] = {}
     if clip == "demo":
         uri = "demo:0"
@@ -182,7 +195,7 @@ def opened(plan: ComparePlan) -> tuple[str, Sequence]:
         camera = open_camera(clip, fps=1)  # names faults of picture and height
         uri = f"{SCHEME}{camera.picture_path}"
         options["view"] = f"{camera.view_heights:g}"
-    elif in_any_case(Path(clip) / "gt" / "gt.txt").is_file():
+    elif Path(clip).is_dir() and in_any_case(Path(clip) / "gt" / "gt.txt").is_file():
         uri = f"mot:{clip}"
     elif Path(clip).exists():
         uri = f"clips:{clip}"
@@ -191,13 +204,7 @@ def opened(plan: ComparePlan) -> tuple[str, Sequence]:
             f"clip {clip!r} does not exist: give a video, a folder of images, a MOTChallenge sequence, demo or "
             f"{SCHEME}PICTURE"
         )
-    options |= _label_options(plan, uri)
-    if options:
-        uri += "?" + "&".join(f"{name}={value}" for name, value in options.items())
-    found = open_dataset(uri, limit=2)
-    if len(found) > 1:
-        raise UserError(f"clip {clip} holds several videos: give one of them")
-    return uri, found[0]
+    return uri, options
 
 
 def _label_options(plan: ComparePlan, uri: str) -> dict[str, str]:

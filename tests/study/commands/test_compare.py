@@ -1,15 +1,20 @@
 """``hvt-study compare`` as a user runs it."""
 
 import json
+import shutil
+from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import pytest
 
 from hvt_common.config import load
+from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_scene import Scene
 from hvt_study.cli import main
+from hvt_study.commands.compare import command_of
 from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, Missing, opened
 from hvt_study.report.figures.drawing import plot, style_of
 from hvt_study.runs.methods import DDS, METHODS
@@ -27,6 +32,7 @@ CHEAP = ("--size", "640x360", "--max-frames", "30", "--jobs", "1")
     ("arguments", "said"),
     [
         (("no-such.mp4",), "no-such.mp4"),
+        (("x" * 300,), "(File name too long): name another"),
         (("still:no-such.jpg",), "no-such.jpg"),
         (("demo", "--rates", "200,fast"), "'fast'"),
         (("demo", "--rates", "-5"), "-5"),
@@ -52,15 +58,26 @@ def test_what_cannot_be_flown_is_one_sentence(tmp_path, capsys, arguments, said)
     assert len([line for line in text.strip().splitlines() if not line.startswith("runs: ")]) == 1
 
 
-def test_labels_of_a_clip_are_found_in_any_case(tmp_path):
+def plan_of(clip, **more):
+    return ComparePlan(str(clip), ModelChoice("aerial-nano", "aerial-nano"), (), clip.parent, **more)
+
+
+def test_labels_of_a_clip_are_found_in_any_case(tmp_path, monkeypatch):
     """A sequence of a system that writes GT was judged by what the detector says, not by its labels."""
-    write_mot(tmp_path / "a")
-    (tmp_path / "a" / "gt").rename(tmp_path / "a" / "GT")
-    (tmp_path / "a" / "GT" / "gt.txt").rename(tmp_path / "a" / "GT" / "gt.TXT")
-    plan = ComparePlan(
-        str(tmp_path / "a"), ModelChoice("aerial-nano", "aerial-nano"), (), tmp_path, labels="exact"
-    )
+    clip = tmp_path / "a"
+    write_mot(clip)
+    for name, other in (("gt", "GT"), ("GT/gt.txt", "GT/gt.TXT"), ("img1", "IMG1")):
+        (clip / name).rename(clip / other)
+    plan = plan_of(clip, labels="exact")
     assert opened(plan)[1].labels is not None
+    row = {"rate_kbps": 300, "method": "M0", "base_width": 160, "base_height": 96, "set_fps": None}
+    assert f" --source {clip / 'IMG1'} --budget 300kbps " in command_of(plan, row)
+    with pytest.raises(UserError, match=r"clip .*A' does not exist: give a video"):
+        opened(plan_of(tmp_path / "A"))
+    shutil.rmtree(clip / "GT")
+    monkeypatch.setattr(Path, "iterdir", Mock(side_effect=PermissionError(13, "Permission denied")))
+    with pytest.raises(UserError, match=r"source folder .*a' cannot be read .Permission denied"):
+        opened(plan_of(clip))
 
 
 @pytest.mark.parametrize("methods", ["M5-jpeg", pytest.param("M0,M5-jpeg", marks=pytest.mark.nightly)])
