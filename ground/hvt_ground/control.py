@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self, TypeVar
@@ -51,7 +51,6 @@ _INBOX_MESSAGES = 64
 _JPEG_QUALITY_PCT = 95
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 
-_Answer = TypeVar("_Answer", Info, ControlAnswer)
 _Message = TypeVar("_Message")
 
 
@@ -129,18 +128,26 @@ class RemoteEdge:
         self._refusal = refusal
 
     def info(self) -> Info:
-        info = self._query(Channel.INFO, b"", Info.parse)
-        if info is None:
+        answers = [self._parsed(Info.parse, data) for data in self._query(Channel.INFO, b"")]
+        if not answers:
             raise UserError(self._absent())
-        return info
+        if (
+            len({info.session_id for info in answers}) > 1
+        ):  # the first may not be the one that the ground shows
+            raise UserError(
+                f"two edges call themselves {self.name}, and both have answered: stop one of them, or start it with "
+                "an --edge-id of its own"
+            )
+        return answers[0]
 
     def tracks(self, *, on_note: Callable[[str], None] = lambda _note: None) -> list[EdgeTrack]:
         """Its present tracks, by its own ids; ``on_note`` is called with a sentence if that is not all."""
-        names = self.info().class_names
-        answer = self.command(Command.TRACKS)
+        self._check_may_command()
+        info = self.info()
+        answer = self._obeyed(info.session_id, Command.TRACKS, {})
         if answer.note:
             on_note(answer.note)
-        name = dict(enumerate(names))
+        name = dict(enumerate(info.class_names))
         return [
             EdgeTrack(
                 one.track_id, name.get(one.class_id, str(one.class_id)), one.confidence, one.box_source_px
@@ -191,7 +198,7 @@ class RemoteEdge:
             for channel in (Channel.ROI, Channel.STATUS)
         ]
         try:
-            answer = self.command(Command.STILL, arguments)
+            answer = self._obeyed(info.session_id, Command.STILL, arguments)
             header, item = self._wait(inbox, answer, until_s=until_s, timeout_s=timeout_s, on_note=on_note)
         finally:
             for subscriber in subscribers:
@@ -208,11 +215,14 @@ class RemoteEdge:
     ) -> ControlAnswer:
         """Send any command of docs/wire.md; return the answer where it is accepted."""
         self._check_may_command()
-        answer = self._commanded(command, arguments or {})
+        return self._obeyed(self.info().session_id, command, arguments or {})
+
+    def _obeyed(
+        self, session_id: int, command: str, arguments: Mapping[str, int | float | str]
+    ) -> ControlAnswer:
+        answer = self._commanded(session_id, command, arguments)
         if answer is None:
-            present = self._query(Channel.INFO, b"", Info.parse) is not None
-            why = control_unanswered(self._session, self.name, who="this key") if present else self._absent()
-            raise UserError(why)
+            raise UserError(control_unanswered(self._session, self.name, who="this key"))
         return answer
 
     def _wait(
@@ -238,7 +248,7 @@ class RemoteEdge:
                 if header and answers == (answer.session_id, answer.still_request):
                     return header, item
             if now_s >= query_s:
-                note = self._note_of(answer.still_request)
+                note = self._note_of(answer)
                 if note and note != noted:
                     on_note(note)
                     noted = note
@@ -247,10 +257,10 @@ class RemoteEdge:
             f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: {self._why_late()}"
         )
 
-    def _note_of(self, number: int) -> str:
+    def _note_of(self, answer: ControlAnswer) -> str:
         # The edge's note on a pending still. Raises `RefusedError` if none comes.
         try:
-            outcome = self._commanded(Command.STILL_OUTCOME, {"ask": number})
+            outcome = self._commanded(answer.session_id, Command.STILL_OUTCOME, {"ask": answer.still_request})
         except RefusedError:
             raise
         except UserError:
@@ -263,14 +273,29 @@ class RemoteEdge:
             return "the link is full, or has lost it"
         return "the edge is not there any more: it has ended, or its link is down"
 
-    def _commanded(self, command: str, arguments: Mapping[str, int | float | str]) -> ControlAnswer | None:
-        # The answer where the edge accepts; None where there is none in time.
+    def _commanded(
+        self, session_id: int, command: str, arguments: Mapping[str, int | float | str]
+    ) -> ControlAnswer | None:
+        # The answer where that session accepts; None where there is none in time. Others refuse.
         try:
-            question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
+            question = ControlRequest(session_id=session_id, command=command, arguments=arguments).pack()
         except ValueError as error:
             raise UserError(f"{command}: {error}") from None
-        answer = self._query(Channel.CONTROL, question, ControlAnswer.parse)
-        if answer is not None and not answer.accepted:
+
+        def is_ours(data: bytes) -> bool:
+            answer = _read(ControlAnswer.parse, data)
+            return answer is not None and answer.session_id == session_id
+
+        answers = self._query(Channel.CONTROL, question, is_last=is_ours)
+        if not answers:
+            return None
+        answer = self._parsed(ControlAnswer.parse, answers[-1])
+        if answer.session_id != session_id:
+            raise RefusedError(
+                f"the session of {self.name} that was asked does not answer, and another one does: it was "
+                "started anew, or two edges have one name"
+            )
+        if not answer.accepted:
             raise RefusedError(f"{self.name} refuses: {answer.reason}")
         return answer
 
@@ -278,18 +303,14 @@ class RemoteEdge:
         if refusal := self._refusal(self.name):
             raise UserError(refusal)
 
-    def _query(self, row: Channel, question: bytes, parse: Callable[[bytes], _Answer]) -> _Answer | None:
-        try:
-            answers = query(self._session, row, keys=self._keys, question=question, timeout_s=ANSWER_S)
-        except zenoh.ZError:
-            return None
-        of = {answer.session_id: answer for answer in (self._parsed(parse, data) for data in answers)}
-        if len(of) > 1:  # whichever answered first may be the one that the ground does not show
-            raise UserError(
-                f"two edges call themselves {self.name}, and both have answered: stop one of them, or start it with "
-                "an --edge-id of its own"
+    def _query(
+        self, row: Channel, question: bytes, is_last: Callable[[bytes], bool] | None = None
+    ) -> list[bytes]:
+        with suppress(zenoh.ZError):
+            return query(
+                self._session, row, keys=self._keys, question=question, timeout_s=ANSWER_S, is_last=is_last
             )
-        return next(iter(of.values()), None)
+        return []
 
     def _absent(self) -> str:
         return (
@@ -297,7 +318,7 @@ class RemoteEdge:
             f"{_link_hint(self._session)}"
         )
 
-    def _parsed(self, parse: Callable[[bytes], _Answer], data: bytes) -> _Answer:
+    def _parsed(self, parse: Callable[[bytes], _Message], data: bytes) -> _Message:
         try:
             return parse(data)
         except UnknownVersionError as error:

@@ -30,7 +30,12 @@ PICTURE = cv2.resize(
 )
 DATA = JpegCodec().encode(PICTURE, quality_pct=90).data
 INFO = replace(
-    messages.INFO, source_size=(960, 540), base_size=(640, 360), view_scale=2 / 3, class_names=("car",)
+    messages.INFO,
+    session_id=7,
+    source_size=(960, 540),
+    base_size=(640, 360),
+    view_scale=2 / 3,
+    class_names=("car",),
 )
 YES = ControlAnswer(session_id=7, accepted=True, reason="", still_request=3, frame_index=40, tracks=())
 HEADER = replace(
@@ -163,7 +168,30 @@ def test_where_two_edges_have_one_name_neither_is_taken_for_the_other(edge, uav)
                 UserError, match="two edges call themselves uav-1, and both have answered: stop one"
             ):
                 request()
-    assert [one.command for one in edge.asked] == ["set-budget"]
+    assert edge.asked == []
+
+
+def test_a_command_is_for_the_session_that_answered(edge, uav):
+    """A second edge of that name, whose own answer comes too late, would obey, or its refusal be told."""
+    heard: list[ControlRequest] = []
+    ended = replace(YES, session_id=8, accepted=False, reason="that session has ended").pack()
+
+    def refuse(question: bytes) -> bytes:
+        heard.append(ControlRequest.parse(question))
+        return ended
+
+    with open_session(LinkSettings("edge", connect=(edge.endpoint,))) as other:
+        serve(other, Channel.CONTROL, keys=KEYS, answer=refuse)
+        eventually(lambda: uav.keyframe() or heard, what="the other is asked")
+        uav.set_budget(5)
+        assert uav.tracks() == []
+        assert uav.still(timeout_s=PATIENT_S).header.session_id == 7
+        assert {one.session_id for one in (*edge.asked, *heard)} == {7}
+        edge.answers = False
+        with pytest.raises(
+            RefusedError, match="session of uav-1 that was asked does not answer, and another"
+        ):
+            uav.keyframe()
 
 
 def test_a_still_that_was_given_up_is_not_waited_for(edge, uav):

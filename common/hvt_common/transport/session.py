@@ -26,6 +26,7 @@ from hvt_common.transport.zenoh_config import LinkSettings, configure, without_b
 _log = logging.getLogger(__name__)
 
 _CLOSE_WITHIN_S = 0.8
+_OTHERS_S = 0.3
 _MAY_COME = re.compile(
     "Cannot assign requested address|Address already in use|No such device|Network is (unreachable|down)"
     "|failed to lookup address"
@@ -156,16 +157,24 @@ def subscribe(
 
 
 def query(
-    session: zenoh.Session, channel: Channel, *, keys: EdgeKeys, question: bytes, timeout_s: float
+    session: zenoh.Session,
+    channel: Channel,
+    *,
+    keys: EdgeKeys,
+    question: bytes,
+    timeout_s: float,
+    is_last: Callable[[bytes], bool] | None = None,
 ) -> list[bytes]:
     """The answers of a queryable channel; none when there is none in time, after ``timeout_s``.
 
-    There are several where several edges have one name. Over UDP a question or its answer may be lost: after half of
-    the time it is asked once more, so it must be a question that is safe to ask twice.
+    There are several where several edges have one name. After the first the others have 0.3 s, or, with ``is_last``,
+    until it accepts one. Over UDP a question or its answer may be lost: after half of the time it is asked once more,
+    so it must be a question that is safe to ask twice.
     """
     found: SimpleQueue[bytes | None] = SimpleQueue()
-
-    def ask(within_s: float) -> None:
+    answers: list[bytes] = []
+    open_questions = 0
+    for within_s in (timeout_s, timeout_s / 2):
         query_later(
             session,
             channel,
@@ -175,17 +184,21 @@ def query(
             on_answer=found.put,
             on_end=lambda: found.put(None),
         )
-
-    answers: list[bytes] = []
-    ask(timeout_s)
-    until_s = time.monotonic() + timeout_s / 2
-    with suppress(Empty):
-        while answer := found.get(timeout=max(0.0, until_s - time.monotonic())):
-            answers.append(answer)
-        return answers
-    if not answers:
-        ask(timeout_s / 2)
-        answers += filter(None, [found.get() or found.get()])
+        open_questions += 1
+        until_s = time.monotonic() + timeout_s / 2
+        with suppress(Empty):
+            while open_questions:
+                answer = found.get(timeout=max(0.0, until_s - time.monotonic()))
+                if answer is None:
+                    open_questions -= 1
+                    continue
+                answers.append(answer)
+                if is_last is not None and is_last(answer):
+                    return answers
+                if is_last is None and len(answers) == 1:
+                    until_s = time.monotonic() + _OTHERS_S
+        if not open_questions or (answers and is_last is None):
+            break
     return answers
 
 

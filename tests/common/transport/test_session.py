@@ -12,6 +12,7 @@ import threading
 import time
 import zlib
 from pathlib import Path
+from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any
 
@@ -495,6 +496,30 @@ def test_a_question_that_is_lost_is_asked_once_more(monkeypatch):
     there = False
     assert query(None, Channel.CONTROL, **told) == []
     assert len(asked_s) == 3, "nobody is there: who waits is told at once"
+
+
+def test_who_stays_silent_is_not_waited_for_once_another_has_answered(monkeypatch):
+    """One that went dark, beside its restarted self, cost every command a second a question."""
+    waits_s: list[float] = []
+    rounds = [[b"yes", b"no"], [], [b"no", b"yes"], [b"no"], [b"no", b"yes", b"no"]]
+
+    class Answers(SimpleQueue):
+        def get(self, timeout: float) -> bytes | None:
+            waits_s.append(timeout)
+            return super().get(block=False)
+
+    def later(*_args, on_answer, **_named):
+        for answer in rounds.pop(0):
+            on_answer(answer)
+
+    monkeypatch.setattr("hvt_common.transport.session.query_later", later)
+    monkeypatch.setattr("hvt_common.transport.session.SimpleQueue", Answers)
+    told: dict[str, Any] = {"keys": EdgeKeys("uav-1"), "question": b"", "timeout_s": 600.0}
+    assert query(None, Channel.INFO, **told) == [b"yes", b"no"]
+    assert waits_s[0] > 200
+    assert max(waits_s[1:]) <= 0.3
+    assert query(None, Channel.INFO, **told) == [b"no", b"yes"], "both that came late"
+    assert query(None, Channel.CONTROL, **told, is_last=b"yes".__eq__) == [b"no", b"no", b"yes"]
 
 
 def test_where_a_declaration_may_be_lost_it_is_made_again(tmp_path):

@@ -400,6 +400,11 @@ ANSWERS = {
     "… has ended: the still does not come",
     "…: …",
     "the answer of … cannot be used: …",
+    "two edges call themselves …, and both have answered: stop one of them, or start it with an --edge-id of its own",
+    (
+        "the session of … that was asked does not answer, and another one does: it was started anew, or two edges "
+        "have one name"
+    ),
 }
 """Every answer of an edge to a command, and what the ground says where there is none that it can use."""
 MORE_ANSWERS = {
