@@ -85,10 +85,6 @@ class LinkDoctor:
         """
         return nullcontext()
 
-    def is_listening(self, endpoints: Sequence[str]) -> bool:  # noqa: ARG002
-        """Whether this process listens at each of these endpoints of Zenoh; True where nobody can say."""
-        return True
-
     def watch(
         self,
         session: zenoh.Session,  # noqa: ARG002

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import atexit
-import ipaddress
 import os
 import re
 import socket
-import stat
 import struct
 import threading
 import time
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import zenoh
 
 from hvt_common.runtime.failures import Failures
+from hvt_common.transport.session import (
+    LISTENING,
+    TCP_TABLES,
+    end_in_table,
+    end_of,
+    end_of_name,
+    ends_of,
+    own_sockets,
+)
 from hvt_common.transport.zenoh_config import connect_endpoints
-
-TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
-UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
 
 _LISTENER = "listener"
 _EVERY_S = 0.25
@@ -38,7 +42,6 @@ _LINGER, _NO_LINGER = struct.pack("ii", 1, 10), struct.pack("ii", 0, 0)
 _LAST_DATA_RECEIVED = 52
 """Offset of ``tcpi_last_data_recv`` (ms) in Linux's ``struct tcp_info``."""
 _FAMILIES = (socket.AF_INET, socket.AF_INET6)
-_LISTENING = "0A"
 _CONNECTS, _NEW = 2, 7
 _UNCONNECTED = (_CONNECTS, _NEW, 10)
 """States of Linux's TCP: a socket that connects, is new or listens has no other end that it could name."""
@@ -60,43 +63,8 @@ def connections(table: Path, *, inodes: Container[str] | None = None) -> Iterato
     """The sockets in one of `TCP_TABLES` but listening ones; with ``inodes`` only those, quickly out of thousands."""
     for line in table.read_text(encoding="ascii").splitlines()[1:]:
         _, ours, theirs, state, *_, inode = line.split(maxsplit=10)[:10]
-        if state != _LISTENING and (inodes is None or inode in inodes):
-            yield Connection(_end(ours), _end(theirs), int(inode))
-
-
-def is_listening(endpoints: Iterable[str]) -> bool:
-    """Whether sockets of this process listen, or take datagrams, at each of these endpoints of Zenoh."""
-    here = {end for end, state in _own(TCP_TABLES) if state == _LISTENING}
-    here |= {end for end, _ in _own(UDP_TABLES)}
-    return all(here & ends_of(end_of(one)) for one in endpoints)
-
-
-def _own(tables: Iterable[Path]) -> Iterator[tuple[str, str]]:
-    # End and state of each socket of this process.
-    own = own_sockets()
-    for table in tables:
-        with suppress(OSError):  # a kernel without IPv6
-            for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                _, ours, _, state, *_, inode = line.split(maxsplit=10)[:10]
-                if int(inode) in own:
-                    yield _end(ours), state
-
-
-def ends_of(end: str) -> set[str]:
-    """All that an end stands for, whose host may be a name; nothing where nobody knows it."""
-    host, _, port = end.rpartition(":")
-    with suppress(OSError, UnicodeError):
-        found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
-        return {_end_of_name(one[4]) for one in found}
-    return set()
-
-
-def end_of(locator: object) -> str:
-    """The end that a locator of Zenoh's names, such as ``tcp/[::1]:7447?prio=1-3``, as `Connection` has it."""
-    host, _, port = re.sub(r"^\w+/|[?#].*", "", str(locator)).rpartition(":")
-    with suppress(ValueError):  # no address of a network
-        host = _host(ipaddress.ip_address(host.strip("[]").partition("%")[0]))
-    return f"{host}:{port}"
+        if state != LISTENING and (inodes is None or inode in inodes):
+            yield Connection(end_in_table(ours), end_in_table(theirs), int(inode))
 
 
 class StaleSockets:
@@ -229,7 +197,7 @@ class StaleSockets:
             with suppress(OSError), same_socket(fd, inode) as one:
                 if not _is_listener(one, self._deaf_ports):
                     continue
-                end = _end_of_name(one.getsockname())
+                end = end_of_name(one.getsockname())
                 if _interface_of(one) not in interfaces:
                     deaf.add(f"{end} hears nothing any more, since its interface was removed")
                 elif one.type == socket.SOCK_DGRAM and (first := _first_of(one)):
@@ -277,7 +245,7 @@ class StaleSockets:
         with suppress(OSError), same_socket(fd, inode) as one:
             if (state := _state(one)) in _UNCONNECTED:
                 return state == _CONNECTS
-            ours, theirs = (_end_of_name(name) for name in (one.getsockname(), one.getpeername()))
+            ours, theirs = (end_of_name(name) for name in (one.getsockname(), one.getpeername()))
             return theirs.rpartition(":")[2] in self._ports and (ours, theirs) not in links
         return False
 
@@ -309,17 +277,6 @@ class StaleSockets:
             probe.sendall(_INIT_SYN)
             probe.recv(1)  # hung up: somebody was there, too
             self._answered_s[theirs] = max(began_s, self._answered_s.get(theirs, 0.0))
-
-
-def own_sockets() -> dict[int, int]:
-    """Inode → descriptor, of this process."""
-    found = {}
-    for one in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # closed meanwhile
-            status = os.fstat(int(one.name))
-            if stat.S_ISSOCK(status.st_mode):
-                found[status.st_ino] = int(one.name)
-    return found
 
 
 def _send_buffers(config: zenoh.Config) -> list[int]:
@@ -411,20 +368,3 @@ def _received_s(fd: int, inode: int) -> float:
         (ago_ms,) = struct.unpack_from("=I", info, _LAST_DATA_RECEIVED)
         return time.monotonic() - float(ago_ms) / 1000
     return time.monotonic()
-
-
-def _end(text: str) -> str:
-    # The kernel writes words of four bytes in the machine's own order.
-    address, _, port = text.rpartition(":")
-    words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
-    return f"{_host(ipaddress.ip_address(struct.pack(f'={len(words)}I', *words)))}:{int(port, 16)}"
-
-
-def _end_of_name(name: tuple[Any, ...]) -> str:
-    return f"{_host(ipaddress.ip_address(name[0].partition('%')[0]))}:{name[1]}"
-
-
-def _host(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
-    if isinstance(address, ipaddress.IPv6Address):
-        return str(address.ipv4_mapped or f"[{address}]")
-    return str(address)

@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from hvt_common.runtime.statistics import Newest
-from hvt_fleet.link.stale_sockets import TCP_TABLES, connections
+from hvt_common.transport.session import TCP_TABLES
+from hvt_fleet.link.stale_sockets import connections
 
 _TIMES, _WITHIN_S = 3, 600.0
 """Who is refused tries again each second, and on a quick link is seen now and then only."""

@@ -80,7 +80,14 @@ def listener(holder: Holder, failures: Failures, protocol: str = "tcp") -> Itera
         yield lambda: bool(session.info.links())
 
 
-@pytest.mark.parametrize("opened", [metrics, web, listener])
+@contextmanager
+def without_its_doctor(holder: Holder, failures: Failures) -> Iterator[Callable[[], bool]]:
+    with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:
+        patch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
+        yield stack.enter_context(listener(holder, failures))
+
+
+@pytest.mark.parametrize("opened", [metrics, web, listener, without_its_doctor])
 def test_a_port_that_another_program_holds_is_waited_for(opened, caplog):
     """The ground of before takes a second to end, and the service is not started again: code 2 is for ever."""
     holder, failures = Holder(), Failures(time.time_ns)
