@@ -19,6 +19,7 @@ from hvt_common.runtime.plug_ins import health_server
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_edge.video.encoder import check_encoder, encoder_names
 from hvt_edge.wiring.storing import open_local_copy
 from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
@@ -121,6 +122,18 @@ def test_an_option_whose_part_is_of_an_extra_that_is_absent(monkeypatch, tmp_pat
         health_server("edge", "127.0.0.1:1", lambda: None, clock=time.time_ns, stuck_s=1, failures=failures)
 
 
+def test_an_encoder_of_hardware_without_its_extra_names_it(monkeypatch):
+    """It would be an encoder that nobody knows, on the board that has it."""
+    brought = encoder_names()[2:]
+    assert "hevc_nvenc" in brought
+    monkeypatch.setattr("hvt_edge.video.encoder.installed", lambda _group: {})
+    monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
+    for name in brought:
+        says = rf"^--encoder {name} is of an extra that is not installed: pip install 'hvt\[edge\]'$"
+        with pytest.raises(UserError, match=says):
+            check_encoder(name)
+
+
 def test_the_names_of_heads_are_those_that_the_library_reads():
     """A head of ``--help`` would be refused, or one could not be named."""
     assert tuple(library_part("heads") or ()) == HEAD_NAMES
@@ -154,7 +167,7 @@ def test_the_embedded_detector_needs_no_library(monkeypatch):
 def test_a_model_of_the_library_that_is_absent(detector, head, says, monkeypatch):
     """It would be a model that nobody knows."""
     monkeypatch.setattr("hvt_common.inference.store.installed", lambda _group: {})
-    remedy = r"the model library is an extra that is not installed: pip install 'hvt\[edge\]'"
+    remedy = r"the model library is an extra that is not installed: pip install 'hvt'"
     with pytest.raises(UserError, match=rf"{re.escape(says)}.*{remedy}"):
         open_detector(detector, head=head)
 
@@ -164,7 +177,7 @@ def test_a_detector_that_is_to_read_stills_without_the_library_is_refused_at_the
     config = GroundConfig(classifier="detector")
     assert ModelFacts.of(config).redetection is not None
     monkeypatch.setattr("hvt_common.inference.store.installed", lambda _group: {})
-    with pytest.raises(UserError, match=r"^--classifier detector is not available: "):
+    with pytest.raises(UserError, match=r"^--classifier detector is not available: .* pip install 'hvt'$"):
         ModelFacts.of(config)
 
 

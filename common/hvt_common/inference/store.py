@@ -30,7 +30,7 @@ MOTION = "motion"
 _GROUP = "hvt.models"
 _JOIN = "+"
 _MOST_PARTS = 3
-MISSING = "the model library is an extra that is not installed: pip install 'hvt[edge]'"
+MISSING = "the model library is an extra that is not installed: pip install 'hvt'"
 
 
 class ModelStore(Protocol):

@@ -247,6 +247,8 @@ PASSTHROUGH = "passthrough"
 """No encoder: the units come from a camera that makes HEVC itself."""
 _WHAT = "encoder"
 _OWN = (X265, PASSTHROUGH)
+_BROUGHT = ("hevc_nvenc", "hevc_qsv", "hevc_v4l2m2m")
+"""Those of the extra that comes with HVT."""
 
 
 def encoder_names() -> tuple[str, ...]:
@@ -258,6 +260,8 @@ def check_encoder(name: str) -> None:
     """Raise `UserError` if no encoder has that name, or more than one; nothing is opened."""
     built_in = name in _OWN
     entry = the_one(GROUP, name, what=_WHAT, built_in=built_in)
+    if entry is None and name in _BROUGHT:
+        raise UserError(f"--encoder {name} is of an extra that is not installed: pip install 'hvt[edge]'")
     if not built_in and entry is None:
         raise UserError(f"--encoder {name!r} is not known: choose one of {', '.join(encoder_names())}")
 

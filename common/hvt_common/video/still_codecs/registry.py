@@ -33,7 +33,7 @@ _BUILT_IN: Mapping[str, str] = MappingProxyType(
         "residual": f"{_PACKAGE}.residual:ResidualCodec",
     }
 )
-_BROUGHT_BY = {"webp": "edge", "avif": "edge", "jxl": "jxl"}
+_BROUGHT_BY = {"webp": "hvt", "avif": "hvt", "jxl": "hvt[jxl]"}
 """Codecs of the extra that comes with HVT, and the package to install for each. They need a library that may be
 missing; ``lacking`` of the class says which."""
 
@@ -58,7 +58,7 @@ def still_codec(name: str) -> StillCodec:
         return _plugged_in(entry)
     if name in _BROUGHT_BY:
         raise UserError(
-            f"still codec {name!r} is of an extra that is not installed: pip install 'hvt[{_BROUGHT_BY[name]}]'"
+            f"still codec {name!r} is of an extra that is not installed: pip install '{_BROUGHT_BY[name]}'"
         )
     raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
 
