@@ -64,7 +64,7 @@ def _fly(name: str) -> CompareResult:
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(name, total=None)
 
-        def on_run(done: int, of: int) -> None:
+        def on_run(done: int, of: int, *_: object) -> None:
             progress.update(task, completed=done, total=of)
 
         plan = ComparePlan(

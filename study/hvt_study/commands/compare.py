@@ -71,7 +71,9 @@ def run(arguments: argparse.Namespace) -> int:
     file = output.check_out(folder, name="compare.json")
     opened, _ = common.open_pool(arguments)
     with output.RunProgress("runs") as progress, opened as pool:
-        result = compare(plan, pool=pool, on_run=progress.update)
+        result = compare(
+            plan, pool=pool, on_run=lambda done, of, alike: progress.update(done, of, alike=alike)
+        )
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
     from hvt_study.report.figures.drawing import plot  # noqa: PLC0415 - Matplotlib, before it says a word

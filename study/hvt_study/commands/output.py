@@ -108,15 +108,18 @@ class RunProgress:
     """How far ``what``, such as runs, is; the time left is told by how fast the last ones were done.
 
     A bar on a terminal. Elsewhere a line at once, also while inputs are still opened, one with the first
-    estimate, and one a minute.
+    estimate, and one a minute, also while none is done.
     """
 
-    def __init__(self, what: str, *, first_line_s: float = _FIRST_LINE_S) -> None:
+    def __init__(
+        self, what: str, *, first_line_s: float = _FIRST_LINE_S, line_every_s: float = _LINE_EVERY_S
+    ) -> None:
         self._what = what
-        self._first_line_s = first_line_s
+        self._first_line_s, self._line_every_s = first_line_s, line_every_s
         self._console = Console(stderr=True, highlight=False)
         self._began_s = self._said_s = time.monotonic()
         self._said = self._estimated = False
+        self._done = self._of = self._failed = 0
         self._steps: deque[tuple[float, int]] = deque([(self._began_s, 0)], maxlen=_REMEMBERED)
         """(time, done); the first is that of the first one done: the start of a study happens once."""
         self._bar = Progress(
@@ -130,24 +133,26 @@ class RunProgress:
         )
         self._task = self._bar.add_task(what, total=None, more="")
         self._lock = threading.Lock()
-        self._first_line = threading.Timer(first_line_s, self._say_first)
-        self._first_line.daemon = True
+        self._ended = threading.Event()
+        self._clock = threading.Thread(target=self._say_now_and_then, name="progress", daemon=True)
 
-    def update(self, done: int, of: int, *, failed: int = 0) -> None:
-        now_s = time.monotonic()
-        if not self._steps[0][1] and done:
-            self._steps.clear()
-        if not self._steps or done != self._steps[-1][1]:
-            self._steps.append((now_s, done))
-        more = self._more(time_left_s(self._steps, of), failed)
-        self._bar.update(self._task, completed=done, total=of, more=more)
-        news = (bool(more) and not self._estimated) or done == of
+    def update(self, done: int, of: int, *, alike: bool = True, failed: int = 0) -> None:
+        """So many are done; where the last was not ``alike``, it says nothing of the time of those that are left."""
         with self._lock:
+            now_s = time.monotonic()
+            if not alike or (done and not self._steps[0][1]):
+                self._steps.clear()
+            if not self._steps or done != self._steps[-1][1]:
+                self._steps.append((now_s, done))
+            self._done, self._of, self._failed = done, of, failed
+            more = self._more(now_s)
+            self._bar.update(self._task, completed=done, total=of, more=more)
+            news = (bool(more) and not self._estimated) or done == of
             first = not self._said and now_s - self._began_s >= self._first_line_s
-            if not self._console.is_terminal and (news or first or now_s - self._said_s >= _LINE_EVERY_S):
-                self._said, self._estimated, self._said_s = True, self._estimated or bool(more), now_s
-                gone = timedelta(seconds=round(now_s - self._began_s))
-                self.note(f"{self._what}: {done} of {of} in {gone}" + f", {more}" * bool(more))
+            if not self._console.is_terminal and (
+                news or first or now_s - self._said_s >= self._line_every_s
+            ):
+                self._say(now_s)
 
     def note(self, text: str) -> None:
         self._console.print(text, markup=False, soft_wrap=True)
@@ -156,22 +161,35 @@ class RunProgress:
         if self._console.is_terminal:
             self._bar.start()
         else:
-            self._first_line.start()
+            self._clock.start()
         return self
 
     def __exit__(self, *_error: object) -> None:
-        self._first_line.cancel()
+        self._ended.set()
         if self._console.is_terminal:
             self._bar.stop()
+        else:
+            self._clock.join()
 
-    def _say_first(self) -> None:
-        with self._lock:
-            if not self._said:
-                self._said, self._said_s = True, time.monotonic()
-                self.note(f"{self._what}: opening what they need")
+    def _say_now_and_then(self) -> None:
+        wait_s = self._first_line_s
+        while not self._ended.wait(wait_s):
+            with self._lock:
+                now_s = time.monotonic()
+                if not self._said or now_s - self._said_s >= self._line_every_s:
+                    self._say(now_s)
+                wait_s = self._said_s + self._line_every_s - now_s
 
-    def _more(self, left_s: float, failed: int) -> str:
-        words = [f"{failed} failed"] if failed else []
+    def _say(self, now_s: float) -> None:
+        more = self._more(now_s)
+        self._said, self._estimated, self._said_s = True, self._estimated or bool(more), now_s
+        gone = timedelta(seconds=round(now_s - self._began_s))
+        far = f"{self._done} of {self._of} in {gone}" if self._of else "opening what they need"
+        self.note(f"{self._what}: {far}" + f", {more}" * bool(more))
+
+    def _more(self, now_s: float) -> str:
+        left_s = time_left_s(self._steps, self._of, now_s)
+        words = [f"{self._failed} failed"] if self._failed else []
         if left_s:
             soon = left_s < _SOON_S
             words.append(
@@ -180,13 +198,17 @@ class RunProgress:
         return ", ".join(words)
 
 
-def time_left_s(steps: deque[tuple[float, int]], of: int) -> float:
+def time_left_s(steps: deque[tuple[float, int]], of: int, now_s: float) -> float:
     """From (time, done) of the last steps, oldest first, to the end; 0 where it is not known yet, or nothing is left.
 
-    Processes that begin together end together: of fewer than `_LEAST` steps nothing is concluded.
+    Processes that begin together end together: of fewer than `_LEAST` steps nothing is concluded. The next step ends
+    now at the earliest.
     """
     (first_s, first), (last_s, last) = steps[0], steps[-1]
-    return (last_s - first_s) / (last - first) * (of - last) if last - first >= _LEAST else 0.0
+    count = last - first
+    if count < _LEAST:
+        return 0.0
+    return max((last_s - first_s) / count, (now_s - first_s) / (count + 1)) * (of - last)
 
 
 def _console() -> Console:

@@ -117,10 +117,11 @@ def compare(
     plan: ComparePlan,
     *,
     pool: Executor,
-    on_run: Callable[[int, int], None] = lambda *_: None,
+    on_run: Callable[[int, int, bool], None] = lambda *_: None,
 ) -> CompareResult:
-    """Fly everything; ``on_run(done, of)`` is called at once and after each method at each rate.
+    """Fly everything; ``on_run(done, of, alike)`` is called at once and after each method at each rate.
 
+    ``alike`` is False after one of more flights than those at the end.
     Raises `UserError` where the clip, a detector or a rate cannot be used.
     """
     uri, sequence = opened(plan)
@@ -148,11 +149,12 @@ def compare(
     order = sorted(specs, key=lambda one: _shapes(specs[one]), reverse=True)
     running = {pool.submit(run, specs[one]): one for one in order}
     done: dict[_Run, dict[str, Any]] = {}
-    on_run(0, len(specs))
+    on_run(0, len(specs), True)
     try:
         for future in as_completed(running):
-            done[running[future]] = future.result()
-            on_run(len(done), len(specs))
+            one = running[future]
+            done[one] = future.result()
+            on_run(len(done), len(specs), _shapes(specs[one]) == _shapes(specs[order[-1]]))
     finally:
         for future in running:
             future.cancel()

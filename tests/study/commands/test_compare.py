@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from concurrent.futures import Executor, Future
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -15,7 +17,7 @@ from hvt_edge.config import check as check_edge
 from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_study.commands.compare import command_of
-from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, Missing, opened
+from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, Missing, compare, opened
 from hvt_study.report.figures.drawing import plot, style_of
 from hvt_study.runs.methods import DDS, METHODS
 from hvt_study.runs.spec import ModelChoice
@@ -78,6 +80,31 @@ def test_labels_of_a_clip_are_found_in_any_case(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "iterdir", Mock(side_effect=PermissionError(13, "Permission denied")))
     with pytest.raises(UserError, match=r"source folder .*a' cannot be read .Permission denied"):
         opened(plan_of(clip))
+
+
+class InTurn(Executor):
+    """Does nothing but remember what it is given."""
+
+    def __init__(self):
+        self.specs = []
+
+    def submit(self, _run, spec, /):
+        self.specs.append(spec)
+        future = Future()
+        future.set_result({"digest": "", "failed": "none of it was flown"})
+        return future
+
+
+def test_runs_of_most_flights_go_first_and_say_nothing_of_the_time_of_others(tmp_path):
+    """One process would fly the longest at the end, alone; and minutes of it be told as hours for all."""
+    pool, said = InTurn(), []
+    plan = replace(plan_of(tmp_path / "a"), clip="demo", rates_bps=(150_000, 800_000))
+    found = compare(plan, pool=pool, on_run=lambda *words: said.append(words))
+    methods = [spec.method for spec in pool.specs]
+    assert methods[:4] == ["M0-best"] * 2 + ["M0-fps"] * 2
+    assert len(found.missing) == len(methods) == 2 * len(COMPARED)
+    assert [(done, of) for done, of, _ in said] == [(done, 18) for done in range(19)]
+    assert sum(not alike for *_, alike in said) == 4
 
 
 @pytest.mark.parametrize("methods", ["M5-jpeg", pytest.param("M0,M5-jpeg", marks=pytest.mark.nightly)])

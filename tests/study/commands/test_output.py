@@ -38,15 +38,41 @@ def test_compare_loads_what_it_flies_with_where_it_flies():
 
 
 @pytest.mark.parametrize(
-    ("steps", "of", "left_s"),
+    ("steps", "now_s", "left_s"),
     [
-        ([(100.0, 1), (110.0, 2), (140.0, 5)], 9, 40.0),
-        *(([(0.0, 0)], 80, 0), ([(20.0, 1), (20.1, 2)], 80, 0)),
+        *(([(100.0, 1), (110.0, 2), (140.0, 5)], now_s, left_s) for now_s, left_s in ((145, 40), (200, 80))),
+        *(([(0.0, 0)], 50, 0), ([(20.0, 1), (20.1, 2)], 50, 0)),
     ],
 )
-def test_the_time_left_is_that_of_the_last_steps(steps, of, left_s):
+def test_the_time_left_is_that_of_the_last_steps(steps, now_s, left_s):
     """Two hours would be told of what takes one; of the first steps, which end together, nothing is concluded."""
-    assert time_left_s(deque(steps), of) == pytest.approx(left_s)
+    assert time_left_s(deque(steps), 9, now_s) == pytest.approx(left_s)
+
+
+def test_of_what_is_unlike_the_rest_no_time_left_is_told(capsys):
+    """The runs of most flights go first: by them ten minutes would take hours."""
+    with RunProgress("runs", first_line_s=60) as runs:
+        for done in range(19):
+            runs.update(done, 40, alike=done in range(1, 5) or done > 15)
+    assert "left" not in capsys.readouterr().err
+    with RunProgress("runs", first_line_s=60) as runs:
+        for done in range(20):
+            runs.update(done, 40, alike=done > 15)
+    assert re.fullmatch(r"runs: 19 of 40 in \S+, .* left\n", capsys.readouterr().err)
+
+
+def test_who_waits_for_one_long_run_reads_how_far_all_is(capsys):
+    """A comparison was silent for as long as its longest run."""
+    said = ""
+
+    def read() -> bool:
+        nonlocal said
+        said += capsys.readouterr().err
+        return said.count("runs: 3 of 7 in 0:") > 2
+
+    with RunProgress("runs", first_line_s=0.02, line_every_s=0.02) as runs:
+        runs.update(3, 7)
+        eventually(read, what="lines while nothing ends")
 
 
 @pytest.mark.parametrize(("left_s", "says"), [(44.0, "less than a minute"), (50.0, "about 0:00:50")])
