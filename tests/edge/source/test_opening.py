@@ -484,8 +484,9 @@ def test_a_camera_plays_whatever_its_boundaries_and_a_picture_that_is_cut_is_cou
     assert path != "torn" or not any(number % 2 for number in numbers(frames))
 
 
-def test_a_page_is_no_camera(jpegs):
+def test_a_page_is_no_camera(jpegs, monkeypatch):
     """What is no picture would be searched for pictures for ever."""
+    monkeypatch.setitem(StreamGrabber.__init__.__kwdefaults__, "open_s", 1.0)
     said = refused(f"{jpegs}/page")
     assert "cannot be opened" in said or "holds no video" in said
 

@@ -27,6 +27,7 @@ from motmetrics.io import loadtxt
 import hvt_ground.cli
 from hvt_archive.exports.command import whole_file
 from hvt_archive.joined import join_recordings
+from hvt_archive.reading import readable
 from hvt_common.errors import UserError
 from hvt_common.units import Limit, utc_text
 from hvt_common.video.hevc import BaseDecoder
@@ -350,19 +351,16 @@ def test_pictures_that_need_a_lost_one_are_not_exported(tmp_path, caplog):
     assert "14 pictures after a hole are left out" in caplog.text
 
 
-def test_a_recording_that_ends_the_process_of_its_reader_is_exported(recording, tmp_path):
+def test_a_recording_that_ends_the_process_of_its_reader_is_exported(recording, tmp_path, capfd):
     """The export ended with a signal, and a panic of the SDK's on the terminal."""
-    broken, out = tmp_path / "broken.rrd", tmp_path / "broken.mp4"
+    broken = tmp_path / "broken.rrd"
     broken.write_bytes(ends_its_reader(recording.read_bytes()))
     reads = f"from rerun.chunk import RrdReader; list(RrdReader({str(broken)!r}).stream())"
-    words = ["-m", "hvt_ground.cli", "export", broken, "--out", out]
-    read, done = (
-        subprocess.run([sys.executable, *one], check=False, capture_output=True, text=True)
-        for one in (["-c", reads], words)
-    )
+    read = subprocess.run([sys.executable, "-c", reads], check=False, capture_output=True)
     assert read.returncode == -signal.SIGABRT
-    assert (done.returncode, "panicked" in done.stderr) == (0, False), done.stderr
-    assert len(shown(out)) == FRAMES
+    readable._tries.rest()  # noqa: SLF001 - one started before would write to where that test looked
+    assert len(shown(export(broken, tmp_path / "broken.mp4"))) == FRAMES
+    assert "panicked" not in capfd.readouterr().err
 
 
 def test_a_split_session_is_exported_as_one(recording, events, tmp_path):
