@@ -64,7 +64,7 @@ def _models(config: GroundConfig) -> Finding:
 
 
 def _recordings(config: GroundConfig) -> Finding:
-    for name, path, suffix in written(config):
+    for name, path, suffix, _ in written(config):
         if is_file(path, suffix):
             check_writable(path, name=name)
         else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, checked, choice, integer, number
 from hvt_common.errors import UserError, check_apart
@@ -20,9 +21,19 @@ from hvt_common.units import Limit, parse_limit
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
 
 
-Written = tuple[str, Path, str]
-"""An output: the option that names it, the path, and its suffix. A path with that suffix is a file, another one
-a folder with a file for each session. Where the suffix is empty the path is always a file."""
+class Written(NamedTuple):
+    """An output. A path with the suffix is a file, another one a folder with a file for each session.
+
+    Where the suffix is empty the path is always a file.
+    """
+
+    name: str
+    """Of its option."""
+    path: Path
+    suffix: str
+    beside: str = ""
+    """The glob of other files that belong to a named one, behind its stem."""
+
 
 _LIMIT = SettingType("LIMIT", parse_limit)
 
@@ -139,7 +150,7 @@ class GroundConfig:
     @property
     def written(self) -> list[Written]:
         given = (("--record", self.record, ".rrd"), ("--summary", self.summary, ""))
-        return [(name, path, suffix) for name, path, suffix in given if path is not None]
+        return [Written(name, path, suffix) for name, path, suffix in given if path is not None]
 
     @property
     def record_folder(self) -> Path | None:
@@ -170,9 +181,9 @@ class GroundConfig:
 def check(config: GroundConfig, *, more: Iterable[Written] = ()) -> GroundConfig:
     """Return the configuration; `UserError` where settings contradict. ``more`` is written, too."""
     files = (
-        (name, path)
-        for name, path, suffix in (*config.written, *more)
-        if path.suffix == (suffix or path.suffix)
+        (one.name, one.path)
+        for one in (*config.written, *more)
+        if one.path.suffix == (one.suffix or one.path.suffix)
     )
     check_apart(files)  # files in a folder have names of their own
     if config.group is not None:

@@ -140,7 +140,7 @@ def test_a_ground_that_is_started_again_keeps_what_it_wrote(tmp_path, caplog):
     files = ["f.rrd", "t.csv", "s.csv", "s-000012.png", "l.hvtlog", "l-before.hvtlog", "m.csv", "o.mcap"]
     for one in files:
         (folder / one).write_text(one)
-    others = ["f-uav-2.rrd", "sum.json", "s-x.png"]
+    others = ["f-uav-2.rrd", "f-before.rrd", "sum.json", "s-x.png", "s-1.png", "t-000012.png", "m-before.csv"]
     for one in others:
         (folder / one).write_text(one)
     words = ["--record f.rrd", "--tracks t.csv", "--stills s.csv", "--log l.hvtlog", "--timing m.csv"]

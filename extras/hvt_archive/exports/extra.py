@@ -41,10 +41,15 @@ class TablesExtra(Extra[TableOptions]):
     options = TableOptions
 
     def writes(self, config: TableOptions) -> Iterable[Written]:
-        for name, suffix in (("tracks", ".csv"), ("stills", ".csv"), ("timing", "")):
+        pictures = f"-{6 * '[0-9]'}*.png"
+        for name, suffix, beside in (
+            ("tracks", ".csv", ""),
+            ("stills", ".csv", pictures),
+            ("timing", "", ""),
+        ):
             path = getattr(config, name)
             if path is not None:
-                yield f"--{name}", path, suffix
+                yield Written(f"--{name}", path, suffix, beside)
 
     def start(self, config: TableOptions, outputs: Outputs) -> OpenSinks:
         if config.tracks is config.stills is config.timing is None:
@@ -74,14 +79,8 @@ class TablesExtra(Extra[TableOptions]):
         return sinks
 
 
-def _open_times(path: Path, taken: set[Path]) -> LineFile:
-    # One that failed stays as it is: the next has a number in its name.
+def _open_times(named: Path, taken: set[Path]) -> LineFile:
     from hvt_archive.exports.tables import timing_table  # noqa: PLC0415
-    from hvt_ground.wiring.sessions import free_path  # noqa: PLC0415
+    from hvt_ground.wiring.sessions import open_again  # noqa: PLC0415
 
-    path = free_path([path], taken, number=2, may_exist=path)
-    try:
-        return timing_table(path)
-    except BaseException:
-        taken.discard(path)
-        raise
+    return open_again(named, taken, timing_table)

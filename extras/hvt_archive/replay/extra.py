@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,7 +53,7 @@ class LogExtra(Extra[LogOptions]):
 
     def writes(self, config: LogOptions) -> Iterable[Written]:
         if config.log is not None:
-            yield "--log", config.log, ""
+            yield Written("--log", config.log, "", f"-before{escape(config.log.suffix)}")
 
     def serve(self, config: LogOptions, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
         if config.log is None:
@@ -77,15 +79,7 @@ class _Logging(Service):
             self._sink.join(time.monotonic() + _END_S)
 
     def _open(self) -> MessageLog:
-        # One that failed stays as it is: the next has a number in its name.
         from hvt_archive.replay.message_log import MessageLog  # noqa: PLC0415
-        from hvt_ground.wiring.sessions import free_path  # noqa: PLC0415
+        from hvt_ground.wiring.sessions import open_again  # noqa: PLC0415
 
-        path = free_path([self._path], self._taken, number=2, may_exist=self._path)
-        try:
-            return MessageLog(path, most_bytes=self._most_bytes)
-        except BaseException:
-            self._taken.discard(path)
-            if path != self._path:
-                path.unlink(missing_ok=True)
-            raise
+        return open_again(self._path, self._taken, partial(MessageLog, most_bytes=self._most_bytes))

@@ -36,7 +36,7 @@ class McapExtra(Extra[McapOptions]):
 
     def writes(self, config: McapOptions) -> Iterable[Written]:
         if config.mcap is not None:
-            yield "--mcap", config.mcap, ".mcap"
+            yield Written("--mcap", config.mcap, ".mcap")
 
     def start(self, config: McapOptions, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         target = config.mcap

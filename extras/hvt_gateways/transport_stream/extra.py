@@ -44,7 +44,7 @@ class TransportStreamExtra(Extra[TransportStreamOptions]):
 
     def writes(self, config: TransportStreamOptions) -> Iterable[Written]:
         if config.ts is not None and "://" not in config.ts:
-            yield "--ts", named_path(config.ts, name="--ts"), ".ts"
+            yield Written("--ts", named_path(config.ts, name="--ts"), ".ts")
 
     def check_outputs(self, config: TransportStreamOptions) -> None:
         """Refuse a destination that is none, or cannot be sent to."""

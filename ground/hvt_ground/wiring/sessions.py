@@ -22,7 +22,7 @@ from hvt_common.protocol.messages import Info
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.edge_backlog import BacklogRecording
-from hvt_ground.config import GroundConfig
+from hvt_ground.config import GroundConfig, Written
 from hvt_ground.events import Event, Refinement
 from hvt_ground.extras import Flight, Opening, Service, extras_of, locators, part_of, written
 from hvt_ground.perception.models import Models
@@ -55,8 +55,8 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = (), records: 
         reads += extra.reads(config)
     for extra in extras_of(config):
         extra.check_outputs(config)
-    here = [("--record", Path(), ".rrd")] if records and config.record is None else []
-    for name, path, suffix in (*written(config), *here):
+    here = [Written("--record", Path(), ".rrd")] if records and config.record is None else []
+    for name, path, suffix, _ in (*written(config), *here):
         if is_file(path, suffix):
             check_writable(path, name=name, reads=reads)
         elif not path.is_dir() and (path.exists() or path.suffix.lower() in _OF_FILES):
@@ -74,7 +74,7 @@ def _is_read_only(folder: Path) -> bool:
 
 def make_folders(config: GroundConfig) -> None:
     """Comes after all that may be refused at once: a start that is refused leaves nothing behind."""
-    for name, path, suffix in written(config):
+    for name, path, suffix, _ in written(config):
         if is_file(path, suffix):
             continue
         try:
@@ -92,21 +92,20 @@ def set_aside(config: GroundConfig) -> None:
     A supervisor starts a ground that died again with the same names, and a flight cannot be received twice. Nothing
     is moved from under another ground that still writes its recording there.
     """
-    if any(suffix == ".rrd" and path.is_file() and _is_written(path) for _, path, suffix in written(config)):
+    if any(
+        suffix == ".rrd" and path.is_file() and _is_written(path) for _, path, suffix, _ in written(config)
+    ):
         return
     stamp = f"earlier-{time.strftime('%Y%m%d-%H%M%S')}"
     stamps = chain([stamp], (f"{stamp}-{number}" for number in count_from(2)))
     # Without a battery the clock says the same at each start.
-    parents = [path.resolve().parent for _, path, _ in written(config)]
+    parents = [one.path.resolve().parent for one in written(config)]
     free = next(one for one in stamps if not any(list(parent.glob(f"{one}*")) for parent in parents))
-    for name, path, suffix in written(config):
+    for name, path, suffix, beside in written(config):
         file = path.resolve()
         numbered = name == "--record" and config.split is not None
         if name == "--summary" or numbered or not is_file(path, suffix) or not file.is_file():
             continue
-        # Beside it: the pictures of a table of stills, the older half of a log.
-        stem = escape(file.stem)
-        beside = [f"{stem}-[0-9]*.png"] if suffix == ".csv" else [f"{stem}-before{escape(file.suffix)}"]
         folder = file.with_name(free)
         try:
             if not file.stat().st_size:
@@ -114,7 +113,7 @@ def set_aside(config: GroundConfig) -> None:
             with suppress(OSError):  # on a full disk there may be no room for a folder, but for a name
                 folder.mkdir(exist_ok=True)
             into = f"{folder}/" if folder.is_dir() else f"{folder}-"
-            for one in chain([file], *(file.parent.glob(pattern) for pattern in beside)):
+            for one in chain([file], file.parent.glob(escape(file.stem) + beside) if beside else ()):
                 one.rename(into + one.name)
         except OSError as error:
             _log.warning("%s %s is written over: it cannot be moved (%s)", name, path, error.strerror)
@@ -180,6 +179,25 @@ def free_path(
     if path == may_exist or not claim:
         taken.add(path)
     return path
+
+
+T = TypeVar("T")
+
+
+def open_again(named: Path, taken: set[Path], make: Callable[[Path], T]) -> T:
+    """Open the file; one that was opened before and failed stays as it is: the next has a number in its name.
+
+    Where ``make`` raises, no numbered file stays, however often that is.
+    """
+    path = free_path([named], taken, number=2, may_exist=named)
+    try:
+        return make(path)
+    except BaseException:
+        taken.discard(path)
+        if path != named:
+            with suppress(OSError):
+                path.unlink()
+        raise
 
 
 S = TypeVar("S", bound=SinkWriter[Any])
@@ -313,7 +331,7 @@ class SessionFactory:
 
     def _give_up(self, path: Path) -> None:
         self._paths.discard(path)
-        if all(path != named for _, named, _ in written(self.config)) and has_nothing(path):
+        if all(path != named for _, named, *_ in written(self.config)) and has_nothing(path):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
 

@@ -1,15 +1,20 @@
 """The table of ``--timing``: what a user reads the latency of each message from."""
 
 import csv
+import errno
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
+from hvt_archive.exports.extra import TableOptions, TablesExtra
 from hvt_archive.exports.tables import TIMING_COLUMNS, LineFile, SessionTiming, timing_table
 from hvt_common.errors import UserError
 from hvt_ground.events import MessageTiming, StillsRead
@@ -87,6 +92,26 @@ def test_a_folder_that_goes_is_noticed(tmp_path):
     with pytest.raises(UserError, match="cannot be written any further: it was removed"):
         table.log("base,1\n")
     table.close()
+
+
+def test_one_that_cannot_be_opened_again_leaves_no_files(tmp_path, monkeypatch):
+    """Without a descriptor to spare each retry left an empty one."""
+    opens: list[Callable[[], LineFile]] = []
+    outputs = SimpleNamespace(open=lambda _part, opening: opens.append(opening))
+    TablesExtra().start(TableOptions(timing=tmp_path / "t.csv"), outputs)  # type: ignore[arg-type]
+    (open_table,) = opens
+    open_table().close()
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "hvt_archive.exports.tables.timing_table",
+            Mock(side_effect=OSError(errno.EMFILE, "Too many open files")),
+        )
+        for _ in range(3):
+            with pytest.raises(OSError, match="Too many open files"):
+                open_table()
+    assert [one.name for one in tmp_path.iterdir()] == ["t.csv"]
+    open_table().close()
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["t-2.csv", "t.csv"]
 
 
 WRITER = r"""
