@@ -233,10 +233,10 @@ class _Replay:
         ended: list[tuple[dict[str, Any], Session]] = []
         edges: dict[str, EdgeSessions] = {}
         with ExitStack() as stack:
-            outputs = Outputs(models.failures)
-            stack.callback(outputs.close)
             view = viewing(cast("ViewerOptions", self._config))
             services = [] if view is None else [stack.enter_context(view)]
+            outputs = Outputs(models.failures)
+            stack.callback(outputs.close)  # before the viewer, which gets the last events
             factory = SessionFactory(
                 self._config, models, clock=self._clock, outputs=outputs, services=services
             )

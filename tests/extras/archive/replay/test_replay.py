@@ -2,9 +2,12 @@
 
 import csv
 import json
+import threading
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgpack
 import pytest
@@ -27,6 +30,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
+from hvt_ground.extras import Flight, Opening, Service
 from rigs.drawn_flight import FRAMES
 
 pytestmark = pytest.mark.integration
@@ -73,6 +77,24 @@ def test_another_detector_sees_something_else_at_the_speed_that_is_asked_for(dra
     assert base != [row for row in lines(drawn.folder / "flight.csv") if row[-1] == "base"]
     assert {row[6] for row in base} == {"moving"}
     assert len(list((tmp_path / "new").glob("*.rrd"))) == 1
+
+
+def test_a_viewer_gets_the_last_events_before_it_ends(drawn, tmp_path, capsys, monkeypatch):
+    """Each replay that was watched ended with a view that had FAILED."""
+    gone, gone_first = threading.Event(), []
+
+    class Viewing(Service):
+        def sinks(self, flight: Flight) -> Iterable[Opening]:
+            last_events = Mock(side_effect=lambda _hurry: gone_first.append(gone.wait(0.5)))
+            yield Opening("live view", lambda: Mock(awaits_keyframe=False, close=last_events))
+
+        def __exit__(self, *_: object) -> None:
+            gone.set()
+
+    monkeypatch.setattr("hvt_archive.replay.command.viewing", lambda _: Viewing())
+    words = ("--detector", "motion", "--classifier", "none", "--record", tmp_path)
+    replay(capsys, drawn.folder / "flight.hvtlog", *words, *SETTINGS)
+    assert (gone_first, gone.is_set()) == ([False], True)
 
 
 def test_what_came_again_in_flight_comes_again(drawn, tmp_path, capsys):
