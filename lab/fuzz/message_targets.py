@@ -10,6 +10,7 @@ import numpy as np
 from hvt_common.protocol import messages as wire
 from hvt_common.protocol.channels import parse_key
 from hvt_common.values import Orientation, Pose
+from hvt_ground.backlog.assembly import backlog_content
 from lab.fuzz.contract import Target
 from lab.fuzz.mutate import Bytes, changed_parts, changed_values, joined, parted, plain, with_checksum
 from rigs import messages
@@ -141,14 +142,14 @@ def _backlog_still(data: bytes) -> None:
     with contextlib.suppress(wire.WireError):
         still = wire.parse_backlog_still(data)
         assert wire.parse_backlog_still(wire.pack_backlog_still(still)) == still
-        with contextlib.suppress(wire.WireError):
-            wire.RoiHeader.parse(still.attachment, still.payload)
+        backlog_content((ROI.session_id, wire.BacklogKind.STILL, ROI.sequence), data, edge="uav-1")
 
 
 def _backlog_units(data: bytes) -> None:
     with contextlib.suppress(wire.WireError):
         units = wire.parse_backlog_units(data)
         assert wire.parse_backlog_units(wire.pack_backlog_units(units)) == units
+        backlog_content((ROI.session_id, wire.BacklogKind.BASE, 0), data, edge="uav-1")
 
 
 def _key(data: bytes) -> None:

@@ -100,6 +100,8 @@ def _commands(data: bytes) -> None:
             answer = rig.commands.answer(request)
             assert answer.accepted != bool(answer.reason)
             assert answer.pack()
+    assert rig.outbox.on_demand_pending <= 4
+    assert rig.reconfiguration.count == 0, "the video has its own time to change"
     if rig.request_ns % (200 * 50 * _MS) == 0:
         rig.run(1)
         rig.out.puts.clear()  # the link of a rig keeps all that is sent

@@ -28,10 +28,12 @@ S = 1_000_000_000
 FPS = 15
 
 
-def flown(seconds: float, *steps: tuple[float, float], **more: Any) -> LiveFlight:
+def flown(
+    seconds: float, *steps: tuple[float, float], cross: tuple[float, float, float] = (0, 0, 0), **more: Any
+) -> LiveFlight:
     """Video alone at 800 kbps over this link."""
     given = {"size": (640, 360), "budget": 800_000, "min_budget": 100_000, "method": "M0"}
-    return LiveFlight(SteppedLink(steps), **given | more).fly(seconds)
+    return LiveFlight(SteppedLink(steps, cross=cross), **given | more).fly(seconds)
 
 
 def controller() -> RateController:
@@ -72,6 +74,14 @@ def test_a_fall_to_a_fifth_and_back():
     assert min(flight.carried_bps(t, t + 2) for t in range(48, 58, 2)) > 0.9 * before
     assert flight.rates[-1][1] == 800_000
     assert len(flight.opened) <= 13
+
+
+def test_cross_traffic_is_given_way_and_taken_back():
+    """Two edges on one radio would starve each other."""
+    flight = flown(35, (0, 1e6), cross=(10, 22, 5e5))
+    assert 400_000 < flight.carried_bps(14, 22) < 500_000
+    assert max(flight.delays_between(10, 22)) < 0.6, "and so are the other's"
+    assert flight.rates[-1][1] == 800_000
 
 
 def test_loss_without_a_queue_lowers_the_rate_where_it_is_heavy():

@@ -50,12 +50,15 @@ _CAMERA_SIZE = (1280, 720)
 class SteppedLink:
     """A link of pieces, (from second, bits a second), with a queue before it.
 
-    With ``loses`` it loses what is sent while it carries nothing; else that waits.
+    With ``loses`` it loses what is sent while it carries nothing; else that waits. ``cross`` is what another one
+    sends into the same queue, (from second, to second, bits a second).
     """
 
     steps: Sequence[tuple[float, float]]
     loses: bool = False
+    cross: tuple[float, float, float] = (0.0, 0.0, 0.0)
     _free_ns: int = 0
+    _seen_ns: int = 0
 
     def bps(self, second: float) -> float:
         at_ns = round(second * SECOND_NS)
@@ -63,6 +66,11 @@ class SteppedLink:
 
     def carry(self, size_bytes: int, *, at_ns: int) -> int | None:
         """When the last bit of it has left; None where it is lost. Nanoseconds since the start."""
+        begin, end, cross_bps = self.cross
+        since_ns, self._seen_ns = max(self._seen_ns, round(begin * SECOND_NS)), at_ns
+        if (since_s := min(end, at_ns / SECOND_NS) - since_ns / SECOND_NS) > 0:
+            self.carry(round(cross_bps * since_s / 8), at_ns=since_ns)
+            self._seen_ns = at_ns
         if self.loses and not self.bps(at_ns / SECOND_NS):
             return None
         now_ns, bits = max(self._free_ns, at_ns), 8.0 * size_bytes

@@ -17,7 +17,7 @@ import json5
 import pytest
 
 from hvt_common.runtime.failures import Failures
-from hvt_common.transport.session import TCP_TABLES, end_of, open_session
+from hvt_common.transport.session import TCP_TABLES, end_of, open_session, own_sockets
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_fleet.link.stale_sockets import StaleSockets, same_socket
 from programs.fleet_keys import Fleet
@@ -77,6 +77,24 @@ def test_a_udp_listener_that_nobody_reads_has_failed():
         assert told == [True]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_one:
             next_one.bind((host, port))
+
+
+def test_whoever_opened_a_listener_learns_that_it_is_deaf(free_port):
+    """No session was ever made anew: a ground that was stopped for some seconds showed nothing any more."""
+    failures, told = Failures(time.time_ns), threading.Event()
+    here = LinkSettings("ground", listen=(f"udp/127.0.0.1:{free_port}",))
+    with (
+        open_session(here, failures=failures, on_deaf=told.set),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unread,
+    ):
+        for inode, fd in own_sockets().items():
+            with suppress(OSError), same_socket(fd, inode) as one:
+                if one.type == socket.SOCK_DGRAM and one.getsockname() == ("127.0.0.1", free_port):
+                    os.dup2(unread.fileno(), fd, inheritable=False)  # which Zenoh does not wait for
+        unread.bind(("127.0.0.1", free_port))
+        unread.sendto(b"one", ("127.0.0.1", free_port))
+        eventually(told.is_set)
+    assert [one.part for one in failures.now] == ["listener"]
 
 
 def test_no_socket_of_zenoh_lingers(free_port):
