@@ -132,7 +132,7 @@ def test_parameters_are_those_of_the_runs(tmp_path):
     assert [flags[at + 1] for at, flag in enumerate(flags) if flag == "--tune"] == list(tuned.tune)
     (video,) = matched_runs(plan, tuned, {"failed": "", "total_bps": 250_000})
     assert (video.method, video.target.total_bps, video.tune) == ("M0", 250_000, ())
-    peer = first_runs(plan_of("DDS"))[0]
+    peer, *_ = first_runs(plan_of("DDS"))
     used = settings(peer, None, budget_bps=300_000, shape=VideoShape(5), named=peer.models)
     assert used["DDS"]["fps"] == 5
     usual = METHODS["M5"].parameters
