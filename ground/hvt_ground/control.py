@@ -131,9 +131,8 @@ class RemoteEdge:
         answers = [self._parsed(Info.parse, data) for data in self._query(Channel.INFO, b"")]
         if not answers:
             raise UserError(self._absent())
-        if (
-            len({info.session_id for info in answers}) > 1
-        ):  # the first may not be the one that the ground shows
+        # The first may not be the one that the ground shows.
+        if len({info.session_id for info in answers}) > 1:
             raise UserError(
                 f"two edges call themselves {self.name}, and both have answered: stop one of them, or start it with "
                 "an --edge-id of its own"

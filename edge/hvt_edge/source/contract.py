@@ -22,6 +22,7 @@ BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or a function that gives it from the source's."""
 
 IDLE_S = 0.25
+"""While no frame comes, a source gives None as often."""
 _LEAST_SIDE_PX, _MOST_SIDE_PX = 64, 8192
 
 

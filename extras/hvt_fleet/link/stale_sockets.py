@@ -18,7 +18,7 @@ from typing import ClassVar, Self
 import zenoh
 
 from hvt_common.runtime.failures import Failures
-from hvt_common.transport.session import (
+from hvt_common.transport.own_sockets import (
     LISTENING,
     TCP_TABLES,
     end_in_table,

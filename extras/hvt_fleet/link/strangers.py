@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from hvt_common.runtime.statistics import Newest
-from hvt_common.transport.session import TCP_TABLES
+from hvt_common.transport.own_sockets import TCP_TABLES
 from hvt_fleet.link.stale_sockets import connections
 
 _TIMES, _WITHIN_S = 3, 600.0

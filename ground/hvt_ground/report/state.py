@@ -127,8 +127,7 @@ class SessionState:
     budget_bps: int = _of(lambda at: at.session.reception.budget_bps)
     """As it is now, like the method; a command shows within half a minute."""
     total_bps: float | None = _live(lambda _, now: now.total_bps)
-    """Over the budget's window, all that crossed the line, like the two below; None while no picture comes, like all
-    that is of now."""
+    """Over the budget's window, all that crossed the line; None while no picture comes, like all that is of now."""
     budget_share: float | None = _live(lambda one, now: now.total_bps / one.reception.budget_bps)
     """The same as a share of the budget."""
     base_bps: float | None = _live(lambda _, now: now.base_bps)

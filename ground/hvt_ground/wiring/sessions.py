@@ -214,8 +214,8 @@ _LOCKSTEP_WAIT_S = 10.0
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    All that they write to is of ``outputs``; ``services`` of extras
-    bring sinks and learn of the recordings, and ``program`` opens a sink of another program.
+    All that they write to is of ``outputs``; ``services`` of extras bring sinks and learn of the recordings, and
+    ``program`` opens a sink of another program.
     """
 
     config: GroundConfig

@@ -1,0 +1,84 @@
+"""The sockets of this process as Linux tells them; Zenoh does not."""
+
+import ipaddress
+import os
+import re
+import socket
+import stat
+import struct
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
+_UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
+LISTENING = "0A"
+"""The kernel's word for it in these tables, which Linux alone has."""
+
+
+def is_listening(endpoints: Iterable[str]) -> bool:
+    """Whether sockets of this process listen, or take datagrams, at each of these endpoints of Zenoh.
+
+    Linux says it: Zenoh does not say when its listener has come.
+    """
+    here = {end for end, state in _own(TCP_TABLES) if state == LISTENING}
+    here |= {end for end, _ in _own(_UDP_TABLES)}
+    return all(here & ends_of(end_of(one)) for one in endpoints)
+
+
+def _own(tables: Iterable[Path]) -> Iterator[tuple[str, str]]:
+    # End and state of each socket of this process.
+    own = own_sockets()
+    for table in tables:
+        with suppress(OSError):  # a kernel without IPv6
+            for line in table.read_text(encoding="ascii").splitlines()[1:]:
+                _, ours, _, state, *_, inode = line.split(maxsplit=10)[:10]
+                if int(inode) in own:
+                    yield end_in_table(ours), state
+
+
+def ends_of(end: str) -> set[str]:
+    """All that an end stands for, whose host may be a name; nothing where nobody knows it."""
+    host, _, port = end.rpartition(":")
+    with suppress(OSError, UnicodeError):
+        found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
+        return {end_of_name(one[4]) for one in found}
+    return set()
+
+
+def end_of(locator: object) -> str:
+    """The end that a locator of Zenoh's names, such as ``tcp/[::1]:7447?prio=1-3``: ``[::1]:7447``."""
+    host, _, port = re.sub(r"^\w+/|[?#].*", "", str(locator)).rpartition(":")
+    with suppress(ValueError):  # no address of a network
+        host = _host(ipaddress.ip_address(host.strip("[]").partition("%")[0]))
+    return f"{host}:{port}"
+
+
+def own_sockets() -> dict[int, int]:
+    """Inode → descriptor, of this process."""
+    found = {}
+    for one in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # closed meanwhile
+            status = os.fstat(int(one.name))
+            if stat.S_ISSOCK(status.st_mode):
+                found[status.st_ino] = int(one.name)
+    return found
+
+
+def end_in_table(text: str) -> str:
+    """The end that the kernel writes as words of four bytes, in the machine's own order."""
+    address, _, port = text.rpartition(":")
+    words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
+    return f"{_host(ipaddress.ip_address(struct.pack(f'={len(words)}I', *words)))}:{int(port, 16)}"
+
+
+def end_of_name(name: tuple[Any, ...]) -> str:
+    """The end of a socket's name."""
+    return f"{_host(ipaddress.ip_address(name[0].partition('%')[0]))}:{name[1]}"
+
+
+def _host(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
+    if isinstance(address, ipaddress.IPv6Address):
+        return str(address.ipv4_mapped or f"[{address}]")
+    return str(address)
