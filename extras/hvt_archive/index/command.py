@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -22,7 +23,11 @@ def run(argv: Sequence[str]) -> int:
     """Print the index's rows; `UserError` without an index."""
     arguments = _parser().parse_args(argv)
     wanted = _wanted(arguments) if arguments.command == "find" else lambda _: True
-    rows = [row for row in read_index(arguments.folder) if wanted(row)]
+    known = read_index(arguments.folder)
+    rows = [row for row in known if wanted(row)]
+    if unread := sum(not row.session for row in known) - sum(not row.session for row in rows):
+        said = f"files that the ground has not read yet, and that may be of them: {unread}"
+        print(f"hvt-ground recordings: {said}", file=sys.stderr)
     if arguments.json:
         print(json.dumps([_as_json(row, arguments.folder) for row in rows], indent=2))
         return 0
@@ -67,7 +72,11 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
         minutes, seconds = divmod(round((row.end_ns - row.begin_ns) / SECOND_NS), 60)
         lasted = f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
     notes = [] if row.video else ["(video removed)"]
-    notes += [] if row.whole else ["(being written, or its ground was killed)"]
+    notes += (
+        []
+        if row.whole
+        else ["(being written, or its ground was killed)" if row.session else "(not read yet)"]
+    )
     classes = ", ".join(f"{count} {name}" for name, count in row.classes.items())
     cells = (
         row.file,
@@ -75,8 +84,8 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
         _utc(row.begin_ns),
         lasted,
         f"{row.size_bytes / 1e6:.1f}",
-        str(row.frames),
-        str(row.stills),
+        str(row.frames) if row.session else "",
+        str(row.stills) if row.session else "",
         " ".join([classes, *notes]).strip(),
     )
     # Names come from the wire: none may move the cursor.
@@ -84,11 +93,16 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
 
 
 def _as_json(row: RecordingRow, folder: Path) -> dict[str, object]:
-    return asdict(row) | {
-        "path": str(folder / row.file),
-        "begin": _utc(row.begin_ns) or None,
-        "end": _utc(row.end_ns) or None,
-    }
+    unknown = {} if row.session else dict.fromkeys(("session", "frames", "stills", "video"))
+    return (
+        asdict(row)
+        | unknown
+        | {
+            "path": str(folder / row.file),
+            "begin": _utc(row.begin_ns) or None,
+            "end": _utc(row.end_ns) or None,
+        }
+    )
 
 
 def _utc(unix_ns: int | None) -> str:

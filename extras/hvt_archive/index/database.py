@@ -112,6 +112,10 @@ class Index:
         except FileNotFoundError:
             return False
 
+    def row(self, file: str) -> RecordingRow | None:
+        """The facts of one file, but its classes; None if it is not known."""
+        return next(iter(_rows(self._database, classes=False, file=file)), None)
+
     def rows(self, *, classes: bool = True) -> list[RecordingRow]:
         """All files, in the order of their times; without ``classes`` it is quicker where there are many."""
         return _rows(self._database, classes=classes)
@@ -180,15 +184,20 @@ def _set_aside(path: Path, error: Exception) -> None:
     path.replace(aside)
 
 
-def _rows(database: sqlite3.Connection, *, classes: bool = True) -> list[RecordingRow]:
+def _rows(
+    database: sqlite3.Connection, *, classes: bool = True, file: str | None = None
+) -> list[RecordingRow]:
     by_file: dict[str, dict[str, int]] = {}
     if classes:
-        for file, name, tracks in database.execute(
+        for one, name, tracks in database.execute(
             "SELECT file, class, tracks FROM classes ORDER BY tracks DESC"
         ):
-            by_file.setdefault(file, {})[name] = tracks
+            by_file.setdefault(one, {})[name] = tracks
     order = "coalesce(begin_ns, written_ns), file"
-    found = database.execute(f"SELECT {', '.join(_COLUMNS)} FROM recordings ORDER BY {order}")  # noqa: S608
+    found = database.execute(
+        f"SELECT {', '.join(_COLUMNS)} FROM recordings WHERE coalesce(file = ?, 1) ORDER BY {order}",  # noqa: S608
+        [file],
+    )
     return [
         RecordingRow(*(*facts, by_file.get(facts[0], {}), bool(backlog), bool(video), bool(whole)))
         for *facts, backlog, video, whole in found

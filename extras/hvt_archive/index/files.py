@@ -24,6 +24,7 @@ from hvt_ground.sinks.rerun.stills import still_of_event
 SCRATCH = ".part"
 """Ends the name of a copy that is being made of a recording."""
 _SPARE_BYTES = 2 * 2**20
+_HEAD_BYTES = 1024
 _PATIENCE_S = 600.0
 _VIDEO = "/base/video"
 _LAYERS = ("/base/tracks", "/base/reported", "/base/refined")
@@ -49,6 +50,14 @@ def is_claimed(path: Path) -> bool:
     """Whether some process writes the file, or has claimed it."""
     with claimed(path) as ours:
         return not ours
+
+
+def begins_as_of(edge: str, path: Path) -> bool:
+    """Whether the first bytes of a file are those of a recording of the edge: the SDK reads none of it."""
+    whose = re.escape(edge.encode())
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    return bool(re.match(rb"RRF2.+?\x12.{1,2}%s-[0-9a-f]+\x1a.{2,4}hvt-%s" % (whose, whose), head, re.DOTALL))
 
 
 def described(path: Path) -> RecordingRow | None:

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 
 from hvt_archive.index.database import Index
-from hvt_archive.index.files import SCRATCH, claimed, described, is_claimed, remove_video
-from hvt_archive.index.retention import Retention, due, is_own_name
+from hvt_archive.index.files import SCRATCH, begins_as_of, claimed, described, is_claimed, remove_video
+from hvt_archive.index.retention import Retention, due, in_name
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import Moment, boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
@@ -28,8 +28,12 @@ from hvt_ground.sinks import QueuedSink, SinkWriter
 _log = logging.getLogger(__name__)
 
 _POLL_S = 60.0
+_BEHIND_S = 0.05
+"""After each file that is read; a flight's rows go before the next."""
 _AGAIN_NS = 3600 * SECOND_NS
 _END_S = 3.0
+_UNREAD = ""
+"""The session of a row that has but the size of its file: the rest of it is not known."""
 _SET_NS = 10 * SECOND_NS
 _DOUBT_NS = 3600 * SECOND_NS
 """For this long after the clock was set no file goes for its age: the clock may be set again."""
@@ -38,9 +42,9 @@ _DOUBT_NS = 3600 * SECOND_NS
 class IndexWriter(SinkWriter[RecordingRow | None]):
     """Writes the index; a sink for one thread. Files are removed when one was closed, or an item is None.
 
-    At the beginning it is compared with the folder: files that are gone are forgotten, those that a killed
-    program left are read, and so are those that it does not know, as far as they have a name of ours. Thousands take
-    minutes: once ``stop`` is set, the rest is left to the next beginning.
+    At the beginning it is compared with the folder: files that are gone are forgotten. Those that a killed program
+    left, and those of a name of ours that it does not know, are ``unread``: thousands take minutes. A None reads one
+    of them, but once a minute it looks. Before that they count as far as their first bytes say whose they are.
 
     A wall clock may be years off, and be set at any time: ages count the time since the index learned of a file,
     which is that of the boot's own clock (`Index.pass_time`). For its age one file goes at a time.
@@ -56,7 +60,6 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         *,
         now_ns: Callable[[], int] = time.time_ns,
         since_boot: Callable[[], tuple[str, int]] = lambda: (boot_id(), since_boot_ns()),
-        stop: threading.Event | None = None,
     ) -> None:
         self._folder = folder
         self._retention = retention
@@ -66,20 +69,25 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         """When the clock was found to have been set, by ``since_boot``."""
         self._refused: dict[str, int] = {}
         """Files that could not be removed or stripped, and when that was tried last (steady time): said once."""
+        self.unread: list[str] = []
+        """The oldest first, by their names: they are read from the newest on."""
         self._index = Index(folder)
         try:
             now = self._pass_time()
-            if self._compare(now.unix_ns, stop or threading.Event()):
-                self._remove_due(now)
+            self._compare(now.unix_ns)
+            self._remove_due(now)
         except BaseException:
             self._index.close()
             raise
 
     def log(self, item: RecordingRow | None) -> None:
-        """Note the facts of a file; None looks for expired files."""
+        """Note the facts of a file; None looks for expired files, or reads one."""
         now = self._pass_time()
         if item is not None:
             self._index.put(replace(item, written_ns=now.unix_ns))
+        elif self.unread and now.steady_ns - self._looked_ns < _POLL_S * SECOND_NS:
+            self._read(self.unread.pop(), now.unix_ns)
+            return
         if item is None or item.whole:
             self._remove_due(now)
 
@@ -94,16 +102,13 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
             self._doubted_ns = now.steady_ns
         return now
 
-    def _compare(self, now_ns: int, stop: threading.Event) -> bool:
-        # Whether it came to the end.
-        known = {row.file: row for row in self._index.rows()}
+    def _compare(self, now_ns: int) -> None:
+        known = {row.file: row for row in self._index.rows(classes=False)}
         there = {one.name for one in self._folder.glob("*.rrd") if one.is_file() and not one.is_symlink()}
         self._index.forget(known.keys() - there)
-        for name in sorted(there):
-            if stop.is_set():
-                return False
-            row, path = known.get(name), self._folder / name
-            if row is None and not is_own_name(name):
+        for name in sorted(there, key=lambda name: (in_name(name)[1], name)):
+            row, path, (edge, _) = known.get(name), self._folder / name, in_name(name)
+            if row is None and not edge:
                 continue
             with claimed(path) as ours:
                 if not ours:
@@ -111,19 +116,32 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
                 path.with_name(name + SCRATCH).unlink(missing_ok=True)  # of a program that was killed
                 if row is not None and row.whole:
                     continue
-                if not path.stat().st_size:  # killed before the first byte
+                size_bytes = path.stat().st_size
+                if not size_bytes:  # killed before the first byte
                     path.unlink()
                     continue
-                found = described(path)
+                if row is None and begins_as_of(edge, path):
+                    # Nobody saw how old one is that is met for the first time.
+                    row = RecordingRow(name, edge, _UNREAD, None, None, now_ns, size_bytes, 0, 0)
+            if row is not None:
+                self._index.put(replace(row, size_bytes=size_bytes))
+            self.unread.append(name)
+
+    def _read(self, name: str, now_ns: int) -> None:
+        path = self._folder / name
+        with claimed(path) as ours:
+            if not ours:
+                return
+            row, found = self._index.row(name), described(path)
             if found is not None and (row is not None or name.startswith(f"hvt-{found.edge}-")):
-                # Nobody saw how old one is that is met for the first time.
                 self._index.put(replace(found, written_ns=now_ns if row is None else row.written_ns))
+            elif row is not None and row.session == _UNREAD:
+                self._index.forget([name])
             elif row is not None:
                 self._index.put(replace(row, size_bytes=path.stat().st_size, whole=True))
-        return True
 
     def _remove_due(self, now: Moment) -> None:
-        retention = self._retention
+        self._looked_ns, retention = now.steady_ns, self._retention
         if not (retention.limits or retention.video_age):
             return
         rows = {row.file: row for row in self._index.rows(classes=False) if _is_plain(row.file)}
@@ -186,6 +204,7 @@ class RecordingsFolder(Service):
         self._retention = retention
         self._failures = failures
         self._sink: QueuedSink[RecordingRow | None] | None = None
+        self._writer: IndexWriter | None = None
         self._stop = threading.Event()
         self._clock = threading.Thread(target=self._poll, name="hvt-recordings", daemon=True)
 
@@ -200,7 +219,8 @@ class RecordingsFolder(Service):
 
     def _opened(self) -> IndexWriter:
         lower_priority()  # with the programs that read files and remove video: live video goes before them
-        return IndexWriter(self._folder, self._retention, stop=self._stop)
+        self._writer = IndexWriter(self._folder, self._retention)
+        return self._writer
 
     def recorded(self, row: RecordingRow) -> None:
         if self._sink is not None:
@@ -215,8 +235,12 @@ class RecordingsFolder(Service):
 
     def _poll(self) -> None:
         # Files grow old while nobody flies, too.
-        while self._sink is not None and not self._stop.wait(_POLL_S):
-            self._sink.log(None)
+        while self._sink is not None and not self._stop.wait(self._pause_s()):
+            if self._sink.idle and self._sink.is_open():
+                self._sink.log(None)
+
+    def _pause_s(self) -> float:
+        return _BEHIND_S if self._writer is None or self._writer.unread else _POLL_S
 
 
 def _is_plain(name: str) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from hvt_common.units import SECOND_NS, Limit
 from hvt_ground.recordings.row import RecordingRow
 
-_OWN = re.compile(r"hvt-.+-(\d{8}-\d{6})(-\d+|-backlog)*\.rrd")
+_OWN = re.compile(r"hvt-(.+)-(\d{8}-\d{6})(-\d+|-backlog)*\.rrd")
 _CLOCK_SET_NS = 1_577_836_800 * SECOND_NS
 """2020: a name of before was given before the machine knew the time, and nobody knows how old the file is."""
 _TRUSTED_SHARE = 1 / 4
@@ -64,7 +64,7 @@ def due(
 
     Each edge has the same share of the bytes that ``limits`` allow: one that sends much evicts nobody else's.
     """
-    ordered = sorted(rows, key=lambda row: (row.written_ns, row.file))
+    ordered = sorted(rows, key=lambda row: (row.written_ns, in_name(row.file)[1], row.file))
     outdated = dict.fromkeys(
         row.file
         for limit in retention.ages
@@ -112,18 +112,16 @@ def _surplus(
             yield row.file
 
 
-def is_own_name(name: str) -> bool:
-    """Whether a ground gives such names of its own accord: a copy that somebody named is his."""
-    return _OWN.fullmatch(name) is not None
+def in_name(name: str) -> tuple[str, str]:
+    """The edge and the local time in a name that a ground gives of its own accord; empty for the copy of somebody."""
+    found = _OWN.fullmatch(name)
+    return (found[1], found[2]) if found else ("", "")
 
 
 def _begun_ns(name: str) -> int | None:
     """The beginning of a file's session by its name, Unix time; None where that says nothing."""
-    found = _OWN.fullmatch(name)
     try:
-        return (
-            None if found is None else int(time.mktime(time.strptime(found[1], "%Y%m%d-%H%M%S"))) * SECOND_NS
-        )
+        return int(time.mktime(time.strptime(in_name(name)[1], "%Y%m%d-%H%M%S"))) * SECOND_NS
     except (ValueError, OverflowError):
         return None
 

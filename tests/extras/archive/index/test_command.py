@@ -79,6 +79,25 @@ def test_find(folder, capsys, words, files):
     assert found(capsys, "find", folder, *words) == files
 
 
+def test_what_was_not_read_yet_is_said_to_be_so(folder, capsys):
+    """It had 0 frames, and a table without it said that there was no truck."""
+    index = Index(folder)
+    index.put(row("e.rrd", "uav-2", NOON_NS, {}, session="", whole=False))
+    index.close()
+    assert found(capsys, "find", folder, "--class", "truck") == ["b.rrd"]
+    hvt_ground.cli.main(["recordings", "find", str(folder), "--class", "truck"])
+    assert capsys.readouterr().err == (
+        "hvt-ground recordings: files that the ground has not read yet, and that may be of them: 1\n"
+    )
+    hvt_ground.cli.main(["recordings", "find", str(folder), "--edge", "uav-2"])
+    out, err = capsys.readouterr()
+    assert (
+        " ".join(next(one for one in out.splitlines() if "e.rrd" in one).split()[-4:])
+        == "135.0 (not read yet)"
+    )
+    assert err == ""
+
+
 def test_as_json(folder, capsys):
     """A program would have to read a table."""
     assert hvt_ground.cli.main(["recordings", "find", str(folder), "--class", "truck", "--json"]) == 0

@@ -105,7 +105,7 @@ def copied(flown: Path, tmp_path: Path) -> Path:
 def look(
     folder: Path, retention: Retention = ALL, *, later_s: float = 0.0, set_by_s: float = 0.0, times: int = 1
 ) -> list[RecordingRow]:
-    """Start a ground there, so much later, which looks so often; what the index says then.
+    """Start a ground there, so much later, which reads what it does not know and looks so often; the index then.
 
     In between somebody set the clock by ``set_by_s``.
     """
@@ -118,6 +118,8 @@ def look(
             since_boot=lambda: (boot_id(), since_boot_ns() + later_ns),
         )
     ) as writer:
+        while writer.unread:
+            writer.log(None)
         for _ in range(times - 1):
             writer.log(None)
     return read_index(folder)
@@ -191,7 +193,7 @@ def test_an_index_that_cannot_be_written_disturbs_no_flight(tmp_path, events, ho
             if how == "no file":
                 (tmp_path / INDEX).rmdir()
             eventually(lambda: failures.parts[0].working, what="it works again")
-    assert [one.file for one in read_index(tmp_path)] == NAMES, "what it missed it reads from the files"
+    assert [one.file for one in look(tmp_path)] == NAMES, "what it missed it reads from the files"
 
 
 def test_a_new_recording_is_not_taken_for_an_empty_one_that_was_left(tmp_path):
@@ -253,7 +255,7 @@ def test_a_ground_that_ends_while_it_reads_many_files_leaves_them_to_the_next(co
     read, failures = [], Failures(time.time_ns)
 
     def described(path: Path) -> RecordingRow | None:
-        read.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+        read.append((path.name, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
         index._stop.wait(60)  # noqa: SLF001 - until it ends
         return files.described(path)
 
@@ -261,10 +263,35 @@ def test_a_ground_that_ends_while_it_reads_many_files_leaves_them_to_the_next(co
     with RecordingsFolder(copied, ALL, failures=failures) as index:
         index.begin()
         eventually(lambda: read, what="it reads")
-    assert (len(read), failures.parts) == (1, ())
-    assert read[0] >= 10
+    assert ([name for name, _ in read], failures.parts) == (NAMES[1:], ())
+    assert read[0][1] >= 10
     monkeypatch.undo()
-    assert [one.file for one in look(copied)] == NAMES
+    assert [(one.file, one.frames) for one in look(copied)] == [(name, 30) for name in NAMES]
+
+
+def test_files_that_were_not_read_yet_count_and_keep_no_flight_waiting(copied, monkeypatch):
+    """After a lost index the disk was full before thousands of files were read, and rows of flights were dropped.
+
+    Of two edges the oldest file goes, not that of the first name; what a stranger put there stays, and counts not.
+    """
+    before = read_index(copied)
+    (copied / INDEX).unlink()
+    strangers = [copied / "hvt-uav-1-20200101-000000.rrd", copied / "hvt-uav-2-20200101-000000.rrd"]
+    strangers[0].write_bytes(bytes(10**8))
+    strangers[1].write_bytes((copied / NAMES[0]).read_bytes())
+    monkeypatch.setattr(folder, "described", lambda path: pytest.fail(f"{path} is read first"))
+    size = Limit(size_bytes=before[1].size_bytes + before[0].size_bytes + 99)
+    with closing(IndexWriter(copied, Retention((size,)))) as writer:
+        row = replace(before[0], file="hvt-a-20000101-000000.rrd", edge="a", size_bytes=100, whole=False)
+        (copied / row.file).touch()
+        assert [one.file for one in read_index(copied)] == NAMES
+        writer.log(row)
+        assert [one.file for one in read_index(copied)] == [row.file, *NAMES]
+        writer.log(replace(row, whole=True))
+        assert [one.file for one in read_index(copied)] == [row.file, NAMES[1]]
+        assert writer.unread == [*(one.name for one in strangers), *NAMES]
+    assert not (copied / NAMES[0]).exists()
+    assert all(one.exists() for one in strangers)
 
 
 def test_by_age_and_by_bytes(copied, caplog):
@@ -434,7 +461,10 @@ def test_a_file_that_ends_the_process_of_its_reader_ends_no_ground(copied):
 from pathlib import Path
 from hvt_archive.index.folder import IndexWriter
 from hvt_archive.index.retention import Retention
-IndexWriter(Path({str(copied)!r}), Retention()).close()
+writer = IndexWriter(Path({str(copied)!r}), Retention())
+while writer.unread:
+    writer.log(None)
+writer.close()
 """
     subprocess.run([sys.executable, "-c", script], check=True)
     after, _ = read_index(copied)
