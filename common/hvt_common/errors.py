@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from hvt_common.redaction import Redaction
 
@@ -122,13 +122,24 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.register("type", Path, _given_path)
+        self.register("type", None, _given_text)
         self.register("type", int, _number(int, "a whole number"))
         self.register("type", float, _number(float, "a number"))
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         return super().parse_known_args(_with_joined_values(args), namespace)
 
+    def add_subparsers(self, **settings: Any) -> Any:
+        commands = super().add_subparsers(**settings)
+        commands.type = str  # it takes all words that follow: the command's own option is to be named
+        return commands
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # That of argparse says nothing where there is no room for it.
+        print(message, end="", file=file or sys.stderr, flush=True)
+
     def error(self, message: str) -> NoReturn:
+        message = re.sub(r"(unrecognized arguments: )(\s*)$", r"\1'\2'", message)
         message = re.sub(r"ignored explicit argument (.*)", r"\1 is given, and it takes no value", message)
         raise UserError(f"{message}; see {self.prog} --help")
 
@@ -148,6 +159,12 @@ def _given_path(text: str) -> Path:
     if not text.strip():  # else it is the folder that this runs in
         raise argparse.ArgumentTypeError(f"{text!r} is empty: give a name")
     return named_path(text)
+
+
+def _given_text(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"{text!r} is empty: leave it out or give it a value")
+    return text
 
 
 def _number(kind: type[float], accepted: str) -> Callable[[str], float]:
@@ -223,10 +240,10 @@ def exit_with_sentence(
         print(end="", flush=True)
     except (UserError, FlightError) as error:
         if not error.said:
-            print(f"{program}: {_in_a_line(redaction.text(str(error)))}", file=sys.stderr)
+            _say(f"{program}: {_in_a_line(redaction.text(str(error)))}")
         return 2 if isinstance(error, UserError) and not isinstance(error, NotYetError) else 1
     except KeyboardInterrupt as error:
-        print(f"{program}: interrupted", file=sys.stderr)
+        _say(f"{program}: interrupted")
         return 128 + next((one for one in error.args if isinstance(one, int)), signal.SIGINT)
     except BrokenPipeError:
         if not _reader_left():
@@ -237,10 +254,18 @@ def exit_with_sentence(
         if not sentence:
             raise
         if isinstance(error, OSError) and error.errno in _FULL:
-            _discard_output()
-        print(f"{program}: {sentence}", file=sys.stderr)
+            _discard(sys.stdout)
+        _say(f"{program}: {sentence}")
         return 1
     return code
+
+
+def _say(sentence: str) -> None:
+    # The exit code is the same where nobody can read it.
+    try:
+        print(sentence, file=sys.stderr, flush=True)
+    except OSError:
+        _discard(sys.stderr)
 
 
 def _in_a_line(sentence: str) -> str:
@@ -311,12 +336,12 @@ def _reader_left() -> bool:
     output.register(sys.stdout.fileno(), 0)
     if not output.poll(0):
         return False
-    _discard_output()
+    _discard(sys.stdout)
     return True
 
 
-def _discard_output() -> None:
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _discard(stream: TextIO) -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextmanager

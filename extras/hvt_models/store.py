@@ -45,7 +45,7 @@ def cache_folder() -> Path:
 
 def file_digest(path: Path) -> str:
     """SHA-256 of a file in 64 hexadecimal digits. Raises `UserError` where it cannot be read."""
-    with telling(f"model file {path} cannot be read (", ")"), path.open("rb") as file:
+    with telling(f"model file {path} cannot be read (", "): name a file that can"), path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -67,6 +67,8 @@ def test_a_command_checks_its_files_too():
             "",
             "argument --it: '' is empty",
         ),  # --out "$OUT" without OUT wrote into the folder that it ran in
+        # --class "$CLASS" without CLASS was an empty table, which says that there is none
+        (None, " ", "argument --it: ' ' is empty: leave it out or give it a value"),
         (int, "1e3", "argument --it: '1e3' is not accepted: give a whole number; see x --help"),
         (float, "3s", "argument --it: '3s' is not accepted: give a number"),
     ],
@@ -74,9 +76,10 @@ def test_a_command_checks_its_files_too():
 def test_a_command_says_what_it_accepts(kind, text, says):
     """It spoke of Python's types."""
     parser = Parser(prog="x")
-    parser.add_argument("--it", type=kind)
+    command = parser.add_subparsers(metavar="COMMAND").add_parser("do", prog="x")
+    command.add_argument("--it", type=kind)
     with pytest.raises(UserError, match=says):
-        parser.parse_args([f"--it={text}"])
+        parser.parse_args(["do", "--it", text])
 
 
 ENDLESS = Path("/dev/zero")
@@ -190,6 +193,17 @@ def test_output_for_which_there_is_no_room_is_a_sentence(tmp_path):
     assert done.returncode == 1
     says = "it: a disk that it writes to is full (No space left on device): make room there"
     assert done.stderr.splitlines() == ["said", says]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+@pytest.mark.parametrize(("word", "full", "code"), [("--help", 1, 1), ("--version", 1, 1), ("--bogus", 2, 2)])
+def test_where_nobody_can_read_what_it_says_the_exit_code_does(word, full, code):
+    """The help was lost with code 0, and a wrong option was code 1, after which a supervisor starts it for ever."""
+    words = [sys.executable, "-m", "hvt_ground.cli", word]
+    done = subprocess.run(
+        ["sh", "-c", f'"$@" {full}>/dev/full', "sh", *words], capture_output=True, check=False
+    )
+    assert (done.returncode, b"Traceback" in done.stderr) == (code, False)
 
 
 @pytest.mark.parametrize(

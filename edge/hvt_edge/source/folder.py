@@ -43,7 +43,9 @@ def sequence_files(folder: Path) -> list[Path]:
     try:
         files = [file for file in folder.iterdir() if names_picture(file) and file.is_file()]
     except OSError as error:
-        raise UserError(f"source folder {str(folder)!r} cannot be read ({error.strerror})") from None
+        raise UserError(
+            f"source folder {str(folder)!r} cannot be read ({error.strerror}): name another"
+        ) from None
     files = [file for file in files if file.suffix.lower() in _USUAL] or files
     times = [re.fullmatch(r"(.*?)([0-9]+)\.([0-9]+)", file.stem) for file in files]
     found = [(one[1], int(one[2]), one[3]) for one in times if one]

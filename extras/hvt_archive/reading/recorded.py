@@ -161,7 +161,7 @@ def readable_part(path: Path, *, done: str) -> Iterator[tuple[Path, bool]]:
     Raises:
         UserError: it cannot be read, or is no recording.
     """
-    with telling(f"recording {path} cannot be read: "):
+    with telling(f"recording {path} cannot be read (", "): give .rrd files of hvt-ground"):
         path.open("rb").close()
     with tempfile.TemporaryDirectory() as folder:
         try:

@@ -127,7 +127,10 @@ def read_log(path: Path) -> Iterator[Received]:
     Raises:
         UserError: it cannot be read, or is no message log.
     """
-    with telling(f"message log {path} cannot be read: "), path.open("rb") as file:
+    with (
+        telling(f"message log {path} cannot be read (", "): give one of hvt-ground --log"),
+        path.open("rb") as file,
+    ):
         if file.read(len(_MAGIC)) != _MAGIC:
             raise UserError(f"{path} is no message log of hvt-ground --log")
         end = file.tell()

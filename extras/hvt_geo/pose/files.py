@@ -87,7 +87,7 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise UserError(f"pose file {path} is none of .csv, .srt (DJI) or .gpx")
-    with telling(f"pose file {path} cannot be read: "):
+    with telling(f"pose file {path} cannot be read (", "): give SRT, CSV or GPX"):
         text = _text(read_bytes(path, most=_MOST_BYTES))
     try:
         poses = _good(reader(text, path), path)

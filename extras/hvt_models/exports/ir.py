@@ -25,7 +25,7 @@ def check_ir_file(path: Path) -> None:
     for part, most in ((path, _MAX_XML_BYTES), (weights, MAX_MODEL_BYTES)):
         if part.stat().st_size > most:
             raise UserError(f"model {part} has {part.stat().st_size} bytes; at most {most} are accepted")
-    with telling(f"model {path} cannot be read: "), path.open("rb") as file:
+    with telling(f"model {path} cannot be read (", "): give an .xml of OpenVINO"), path.open("rb") as file:
         begin = file.read(_FIRST_BYTES)
     if b"<net" not in begin or b"<!DOCTYPE" in begin or b"<!ENTITY" in begin:
         raise UserError(f"model {path} is not an OpenVINO model (it begins with no <net>)")

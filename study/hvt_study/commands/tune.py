@@ -189,7 +189,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_pool_arguments(parser)
     parser.add_argument("--method", required=True, help="method to tune, such as M5")
     add = parser.add_argument
-    add("--parameters", default="", metavar="NAME,…", help="which of its parameters (default: all)")
+    add("--parameters", metavar="NAME,…", help="which of its parameters (default: all)")
     add("--trials", type=int, default=40, metavar="N", help="sets of parameters to try")
     add(
         "--held-out",
@@ -204,7 +204,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     common.check_whole("--trials", arguments.trials, 1, _MOST_TRIALS)
     common.check_whole("--seed", arguments.seed, 0, _HIGHEST_SEED)
-    parameters = tunable(arguments.method, common.names_of(arguments.parameters))
+    parameters = tunable(arguments.method, common.names_of(arguments.parameters or ""))
     sequences = common.open_sequences(arguments)
     plan = common.study_plan(arguments, sequences)
     if len(plan.still_codecs) > 1:

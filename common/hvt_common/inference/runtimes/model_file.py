@@ -72,7 +72,7 @@ def check_onnx_file(path: Path) -> None:
         raise absent(path)(f"model {path} does not exist; an ONNX file is expected")
     if not path.is_file():
         raise UserError(f"model {path} is not a file; an ONNX file is expected")
-    with telling(f"model {path} cannot be read: "):
+    with telling(f"model {path} cannot be read (", "): name a file that can"):
         status = path.stat()
         young = time.time_ns() - status.st_mtime_ns < _YOUNG_NS
         check = _check_file.__wrapped__ if young else _check_file

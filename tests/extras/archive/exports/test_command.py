@@ -409,8 +409,8 @@ def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
     for words, said in (
         ("{wrong} --to mp4", "wrong.rrd is no recording"),
         ("{foreign} --to mp4", "foreign.rrd is no recording"),
-        ("{absent} --to mp4", "absent.rrd cannot be read: No such file"),
-        ("{here} --to csv", f"{tmp_path} cannot be read: Is a directory"),
+        ("{absent} --to mp4", "absent.rrd cannot be read (No such file or directory): give .rrd files"),
+        ("{here} --to csv", f"{tmp_path} cannot be read (Is a directory): give .rrd files"),
         ("{good}", "--to is missing: give one of mp4, mkv, ts"),
         ("{good} --to avi", "'avi'"),
         ("{good} --to csv --burn-in", "--burn-in draws into video, and --to is csv"),
