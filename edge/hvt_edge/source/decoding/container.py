@@ -148,10 +148,10 @@ def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: Non
         return None
     best = container.streams.best("video")
 
-    def rank(stream: Any) -> tuple[bool, bool, int, int]:
+    def rank(stream: Any) -> tuple[bool, int, bool, int]:
         codec = stream.codec_context
         is_default = bool(stream.disposition & Disposition.default)
-        return is_default, stream is best, codec.width * codec.height, -stream.index
+        return is_default, codec.width * codec.height, stream is best, -stream.index
 
     if films[0].disposition & Disposition.attached_pic:
         note("it holds no film: what is shown is its cover picture")
@@ -274,8 +274,9 @@ def decoded(
             _log.warning("%s: %s", name, timeline.says)
     if len(timeline.jumps) > 1:
         _log.warning("%s: its time stamps jumped %d times in all", name, len(timeline.jumps))
-    if timeline.jumps and before_s is not None:
-        reading.end_s = before_s + stamps.period_s
+    if timeline.jumps and before_s is not None:  # a header counts the steps ahead that were mended
+        ahead_s = sum((step_s for _, step_s in timeline.jumps if step_s > 0), Fraction(0))
+        reading.end_s = before_s + stamps.period_s + ahead_s
     for sentence in reading.faults():
         _log.warning("%s %s", name, sentence)
 
@@ -374,6 +375,8 @@ class _Reading:
                 return f"its fragments are not in a row: number {later} follows {before}"
         if numbers and numbers[0] > 2 and not joined:
             return f"its first fragment is number {numbers[0]}: is its beginning missing?"
+        if numbers and not all(re.fullmatch(rb"[ -~]{4}", kind) for kind, _ in boxes):
+            return f"its last {size - self._end_byte} bytes hold no fragment that can be read"
         ends = name in _WITHOUT_INDEX or joined
         behind = 1 - self._end_byte / size if size and ends else 0
         if behind > _MOST_BEHIND:

@@ -92,11 +92,12 @@ def test_a_film_runs_at_its_own_rate_and_guesses_are_said(tmp_path, caplog, name
 
 
 @pytest.mark.parametrize("late", [1, 30, 59])
-def test_a_stamp_far_ahead_repeats_no_picture(tmp_path, late):
-    """A picture would be shown for ten hours."""
+def test_a_stamp_far_ahead_repeats_no_picture(tmp_path, caplog, late):
+    """A picture would be shown for ten hours, or the clip, of which nothing is lost, be called unfinished."""
     times = [33 * one + 37_600_000 * (one >= late) for one in range(60)]
     clip = write_numbered(tmp_path / "a.mkv", 60, times_ms=times, bf="0")
     assert len(play(clip)[1]) in range(58, 62)
+    assert "unfinished" not in caplog.text
 
 
 @pytest.mark.parametrize("name", ["a.mkv", "a.mp4", "a.ts"])
@@ -132,24 +133,31 @@ def test_pictures_that_a_decoder_patched_are_counted(tmp_path, caplog):
 # -- which stream, which shape ----------------------------------------------
 
 
-@pytest.mark.parametrize("attached", [False, True])
-def test_a_cover_picture_is_no_film(tmp_path, attached):
-    """A grey picture would be flown in place of the film."""
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        cover, film = container.add_stream("mjpeg", rate=30), container.add_stream("libx264", rate=30)
-        cover.width, cover.height, cover.pix_fmt = 640, 480, "yuvj420p"
+@pytest.mark.parametrize(
+    ("name", "codec", "size", "count", "attached"),
+    [
+        ("a.mp4", "mjpeg", (640, 480), 1, False),
+        ("a.mp4", "mjpeg", (640, 480), 1, True),
+        ("a.ts", "libx264", (160, 120), 30, False),
+    ],
+    ids=["cover", "marked cover", "preview"],
+)
+def test_a_cover_picture_or_preview_is_no_film(tmp_path, name, codec, size, count, attached):
+    """A grey or small picture would be flown in place of the film."""
+    with av.open(str(tmp_path / name), "w") as container:
+        cover, film = container.add_stream(codec, rate=30), container.add_stream("libx264", rate=30)
+        cover.width, cover.height = size
+        cover.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
         film.width, film.height, film.pix_fmt = 320, 240, "yuv420p"
         if attached:
             cover.disposition = Disposition.attached_pic
-        for stream, pictures in (
-            (cover, [np.full((480, 640, 3), 60, np.uint8)]),
-            (film, map(numbered, range(30))),
-        ):
+        grey = np.full((*size[::-1], 3), 60, np.uint8)
+        for stream, pictures in ((cover, [grey] * count), (film, map(numbered, range(30)))):
             for picture in pictures:
                 frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
                 container.mux(stream.encode(frame.reformat(format=stream.pix_fmt)))
             container.mux(stream.encode(None))
-    source, pictures = play(tmp_path / "a.mp4")
+    source, pictures = play(tmp_path / name)
     assert numbers(pictures) == list(range(30))
     assert "is the film (h264, 320x240)" in source.notes[0]
 

@@ -86,6 +86,14 @@ def without_fragments(tmp_path, missing):
     return clip
 
 
+def with_hole(tmp_path):
+    clip = without_fragments(tmp_path, slice(0))
+    data = clip.read_bytes()
+    third = [found.start() for found in re.finditer(b"moof", data)][2]
+    clip.write_bytes(data[: third - 200] + bytes(400) + data[third + 200 :])
+    return clip
+
+
 def without_segment(tmp_path, number):
     playlist = write(tmp_path / "a.m3u8", range(180), group=60, hls_time="2", hls_list_size="0")
     (tmp_path / f"a{number}.ts").unlink()
@@ -123,6 +131,8 @@ def without_packets(tmp_path):
             lambda at: without_fragments(at, slice(1, 2)),
             "unfinished: its fragments are not in a row: number 3 follows",
         ),
+        # Half of a recording was lost where some sectors of its disk were.
+        (with_hole, "bytes hold no fragment that can be read"),
         (lambda at: without_segment(at, 0), "it is 2.0 s shorter than its header says"),
         (lambda at: without_segment(at, 1), "stands for 2.0 s"),
         # Who looks for a fault of the disk or the link would look in vain.
