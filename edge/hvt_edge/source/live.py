@@ -241,7 +241,7 @@ _MEMORY_NS = 60 * SECOND_NS
 """The least delay of the last one to two of these periods counts: two clocks drift apart."""
 
 _STEP_NS = SECOND_NS
-"""Largest change of the delay from one frame to the next without a clock that was set."""
+"""Largest step of the stamps, and of the delay, from one frame to the next without a clock that was set."""
 _MOST_BEHIND_NS = 2 * SECOND_NS
 """Delay that has grown beyond this step by step means another length of a second: 25 stamps a second, 24 frames."""
 _RECENT = 32
@@ -266,7 +266,8 @@ class CameraClock:
         """The camera was opened again: its stamps may count from another time from now on."""
         self._least_ns: int | None = None
         self._former_ns: int | None = None
-        self._delay_ns: int | None = None
+        self._before: tuple[int, int] | None = None
+        """(camera's time, delay) of the newest frame."""
         self._since_ns = 0
         self._recent: deque[int] = deque(maxlen=_RECENT)
         """Delays of the newest frames."""
@@ -278,7 +279,7 @@ class CameraClock:
 
     def capture_ns(self, camera_ns: int | None, *, now_ns: int) -> int:
         """The capture time of the frame that has just come; ``camera_ns`` is None where the camera gives none."""
-        taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(now_ns - camera_ns, now_ns)
+        taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(camera_ns, now_ns)
         taken_ns = min(taken_ns, now_ns)
         if taken_ns <= self._last_ns:
             taken_ns = self._last_ns + max(1, (now_ns - self._came_ns) // 2)
@@ -286,12 +287,15 @@ class CameraClock:
         self._recent.append(now_ns - self._last_ns)
         return self._last_ns
 
-    def _ahead_ns(self, delay_ns: int, now_ns: int) -> int:
-        if self._delay_ns is not None and abs(delay_ns - self._delay_ns) > _STEP_NS:
+    def _ahead_ns(self, camera_ns: int, now_ns: int) -> int:
+        delay_ns = now_ns - camera_ns
+        # Frames that a network held back are late, but their stamps go on.
+        steps = [abs(b - a) for a, b in zip(self._before or (), (camera_ns, delay_ns), strict=False)]
+        if steps and min(steps) > _STEP_NS:
             self._least_ns = self._former_ns = None  # one of the two clocks was set
         elif self._least_ns is not None and delay_ns - self._least_ns > _MOST_BEHIND_NS:
             self._least_ns = self._former_ns = None
-        self._delay_ns = delay_ns
+        self._before = camera_ns, delay_ns
         if self._least_ns is None or now_ns - self._since_ns > _MEMORY_NS:
             self._former_ns, self._least_ns, self._since_ns = self._least_ns, delay_ns, now_ns
         self._least_ns = min(self._least_ns, delay_ns)

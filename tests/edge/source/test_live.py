@@ -79,6 +79,15 @@ def test_camera_times_without_jitter_and_never_back():
     assert clock.capture_ns(None, now_ns=zero + 400 * MS) == zero + 400 * MS
 
 
+def test_frames_that_a_network_held_back_are_as_old_as_they_are():
+    """Boxes of before a stall would lie where the camera looked behind it, and old pictures be called live."""
+    clock, zero = CameraClock(), 1_000_000 * SECOND_NS
+    for number in range(300):  # from 4 s on nothing comes for 1.5 s, and then frames at twice their rate
+        taken_ns = number * SECOND_NS // 30
+        come_ns = max(taken_ns, 5500 * MS + (taken_ns - 4 * SECOND_NS) // 2) if number >= 120 else taken_ns
+        assert clock.capture_ns(taken_ns, now_ns=zero + come_ns) == zero + taken_ns
+
+
 def test_a_camera_that_says_its_time_late_stops_no_picture():
     """Its first RTCP report comes seconds after its first frame: no frame would be due until its time had been."""
     clock, gate, times = CameraClock(), Gate(15), []
