@@ -333,7 +333,7 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
         raise absent(file)(f"--config {file} does not exist: give a TOML file") from None
     except OSError as error:
         raise UserError(f"--config {file} cannot be read ({error.strerror}): give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"--config {file} is not valid TOML: {error}") from None
     values: dict[str, Any] = {}
     for key, given in table.items():

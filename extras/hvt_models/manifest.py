@@ -71,7 +71,7 @@ def parse_manifest(text: str, *, origin: str) -> dict[str, ModelEntry]:
     """Read a manifest. Raises `UserError` where it is none, in a sentence that names ``origin``."""
     try:
         tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{origin} is not valid TOML ({error})") from error
     return {name: _entry(name, table, origin=origin) for name, table in tables.items()}
 

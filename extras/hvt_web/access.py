@@ -159,7 +159,7 @@ def own_tokens(folder: Path | None = None) -> Mapping[Role, str]:
         raise UserError(
             f"the tokens of --web cannot be kept in {file} ({error.strerror}): XDG_STATE_HOME names another place"
         ) from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, RecursionError, KeyError, TypeError):
         tokens = {}
     if not tokens or any(len(one) < _LEAST_TOKEN for one in tokens.values()):
         raise UserError(f"{file} holds no tokens: remove it, and new ones are made")

@@ -112,6 +112,7 @@ def test_what_was_set_is_told_apart_from_what_was_not(tmp_path):
         ("wait = -1", "is not a duration"),
         ("budget = ", "is not valid TOML"),
         ("a = 1\na = 2", "is not valid TOML"),
+        pytest.param(f"a = {'[' * 9999}", "is not valid TOML", id="deep"),
     ],
 )
 def test_a_wrong_file_is_one_sentence(tmp_path, text, said):

@@ -75,7 +75,7 @@ class StatusCommand:
                 raise FlightError(f"what answers at {address} says: {word}")
             state: dict[str, Any] = json.loads(data)
             return state, self.table(state)
-        except (OSError, HTTPException, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, HTTPException, ValueError, RecursionError, KeyError, TypeError, AttributeError):
             raise FlightError(
                 f"no {self.what} answers at {address}: start one with --metrics {address}, or say where it is with "
                 "--at"

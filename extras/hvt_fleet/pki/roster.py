@@ -67,7 +67,7 @@ class Roster:
             )
         except FileNotFoundError:
             return cls()
-        except (OSError, ValueError, KeyError, TypeError, UserError) as error:
+        except (OSError, ValueError, RecursionError, KeyError, TypeError, UserError) as error:
             raise UserError(f"{path} is not a roster as hvt-ground keys writes it ({error})") from None
         return cls(edges, grounds, routers)
 

@@ -290,7 +290,7 @@ def test_the_links_at_the_start_open_the_page(host, port, state_folder, monkeypa
         )
 
 
-@pytest.mark.parametrize("content", ["", "nonsense", "[]", '{"operator": "x", "viewer": "y"}'])
+@pytest.mark.parametrize("content", ["", "nonsense", "[]", "[" * 99_999, '{"operator": "x", "viewer": "y"}'])
 def test_a_spoilt_token_file_is_one_sentence(port, state_folder, content):
     """The ground would start with a traceback, or with an empty password."""
     state_folder.mkdir()

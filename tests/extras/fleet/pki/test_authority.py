@@ -300,7 +300,7 @@ def test_a_folder_without_a_ca_or_with_a_foreign_roster_is_a_sentence(tmp_path: 
     with pytest.raises(UserError, match="holds no CA: make one with hvt-ground keys new-ca"):
         run(["add-edge", "uav-1", "--dir", str(tmp_path)])
     assert list(tmp_path.iterdir()) == []
-    for text in ("[]", "{", json.dumps({"edges": ["A B"], "grounds": [], "routers": []})):
+    for text in ("[]", "{", "[" * 99_999, json.dumps({"edges": ["A B"], "grounds": [], "routers": []})):
         (tmp_path / "fleet.json").write_text(text)
         with pytest.raises(UserError, match="is not a roster as hvt-ground keys writes it"):
             Roster.read(tmp_path)
