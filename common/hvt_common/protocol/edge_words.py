@@ -76,6 +76,7 @@ PART_WORDS: Mapping[str, str] = MappingProxyType(
         "stills": "the choice of stills",
         "requested stills": "making closer looks",
         "reports": "taking reports of grounds",
+        "pictures": "pictures on their way to a ground",
         "store": "the store for outages",
         "backlog": "sending what was stored",
         "info": "telling grounds of the flight",

@@ -63,10 +63,11 @@ class Outage:
         self.reports = False
         """Whether a ground has ever reported on this session: without reports no arrival is known."""
 
-    def reported(self, now_ns: int, *, named: int = -1, sent: int = -1) -> None:
+    def reported(self, now_ns: int, *, named: int = -1, sent: int = -1, misses_video: bool = False) -> None:
         """A ground has reported (any thread): ``named`` is the last base message that it received, of those ``sent``.
 
-        A ground that takes no video names none (-1); that is no news while another ground reports video.
+        A ground that takes no video names none (-1); that is no news while another ground reports video. One that
+        ``misses_video`` misses the video: without another one that has it, that is an outage at once.
         """
         again = not self.reports_now(now_ns)
         if sent > self._sent:
@@ -76,10 +77,10 @@ class Outage:
             _PAUSE_NS, 3 * self._each_ns // 2
         ):
             self._news_ns += now_ns - self._reported_ns
-        if named >= 0:
+        if named >= 0 or misses_video:
             self._named_ns = now_ns
         alone = now_ns - self._named_ns >= SILENCE_NS
-        if again or alone or self._named < named <= sent or named == sent:
+        if (again and not misses_video) or alone or self._named < named <= sent or named == sent:
             self._news_ns = now_ns
         if named <= sent:
             self._named = max(self._named, named)
@@ -287,8 +288,8 @@ class BacklogStage:
     def on_feedback(self, feedback: Feedback, *, now_ns: int) -> None:
         named = feedback.base_sequence
         # After the last frame no later one can show that an earlier one was lost.
-        sent = named if self._finishing else self._line.base_sequence
-        self._outage.reported(now_ns, named=named, sent=sent)
+        sent = named if self._finishing and not feedback.misses_video else self._line.base_sequence
+        self._outage.reported(now_ns, named=named, sent=sent, misses_video=feedback.misses_video)
         if feedback.backlog:
             self.worker.intake.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)
 

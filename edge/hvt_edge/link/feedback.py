@@ -88,7 +88,9 @@ class PrimaryReceiver:
         if feedback.receiver_id != self._receiver_id:
             # A ground that reports but never names anything new must not keep the edge from all the others; as long
             # as it has named nothing at all, everything that was sent counts as new.
-            there = sent[0] if self._named == (-1, -1) else feedback.base_sequence
+            there = feedback.base_sequence
+            if self._named == (-1, -1) and not feedback.misses_video:
+                there = sent[0]
             if there - self._named[0] >= _MISSED:
                 quiet_ns = max(quiet_ns, now_ns - self._progress_ns)
             return True if quiet_ns >= _OTHER_RECEIVER_NS else None

@@ -46,7 +46,13 @@ and a quarter of two cores, boxes were 2.4 s old."""
 _BEHIND_SHARE = 0.5
 """Share of the time between two frames: beyond it the loop is late."""
 
-_PART = "reports"
+_PART, _PICTURES = "reports", "pictures"
+_UNSEEN_NS = 10 * SECOND_NS
+"""A ground reports it once it has waited for 4 s; a first picture may take that long on a slow link."""
+_UNSEEN = (
+    "a ground hears the edge and gets no picture: large packets are lost on the way (lower the MTU of the tunnel), "
+    "or the link is too slow for one"
+)
 _MOST_WAIT_NS, _MOST_WAIT_FRAMES = 100_000_000, 1.5
 """A frame that would wait longer than both for the budget's window is left out before it is encoded. A wait until the
 camera's next frame costs none, and frames wait about that long for a second after a keyframe that took long to code.
@@ -231,6 +237,9 @@ class LinkControl:
         self.transmitter, self.backlog = self.stills.transmitter, self.stills.backlog
         self.pacer = self.transmitter.pacer
         self._had_ground = False
+        self._unseen_ns: int | None = None
+        """Since when the primary receiver sees nothing."""
+        self._unseen_failure = 0
         self._primary = PrimaryReceiver()
 
     def before_frame(self, now_ns: int) -> None:
@@ -242,6 +251,7 @@ class LinkControl:
         offline = self.backlog is not None and self.backlog.before_frame(now_ns, linked=linked)
         if not linked:
             self._primary.forget()
+            self._note_seen(True, now_ns)
         if self.pacer is None:
             return
         back = self.pacer.link(linked, reports=ground, now_ns=now_ns)
@@ -296,6 +306,17 @@ class LinkControl:
         if not self.failures.attempt(_PART, self._apply, False, feedback) and self.pacer is not None:
             self.pacer.on_fault(self.clock())
 
+    def _note_seen(self, seen: bool, now_ns: int) -> None:  # noqa: FBT001 - the news itself
+        # Both threads: whichever is later, the next report sets it right.
+        if seen:
+            self._unseen_ns = None
+            self.failures.over(_PICTURES, self._unseen_failure)
+            self._unseen_failure = 0
+        elif self._unseen_ns is None:
+            self._unseen_ns = now_ns
+        elif not self._unseen_failure and now_ns - self._unseen_ns >= _UNSEEN_NS:
+            self._unseen_failure = self.failures.failed(_PICTURES, _UNSEEN)
+
     def _apply(self, feedback: Feedback) -> bool:
         # The decision whether the report counts is made here, once.
         now_ns = self.clock()
@@ -306,6 +327,7 @@ class LinkControl:
             self.pacer.on_report(report)
             self.keyframes.note_round_trip(self.pacer.round_trip_ns)
         if report.primary:
+            self._note_seen(not feedback.misses_video, now_ns)
             self.transmitter.in_flight.on_report(feedback.base_sequence, feedback.missing_base)
             self.stills.outbox.on_report(
                 report.feedback.still_sequence,

@@ -6,14 +6,17 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
+from typing import Any
 
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
     BacklogHeader,
     BaseHeader,
     CaptureTimes,
+    Feedback,
+    Flags,
     PoseReport,
     RoiHeader,
     Status,
@@ -44,6 +47,8 @@ _MOST_HELD = 16
 _UNSEEN_NS, _UNSEEN = 15 * SECOND_NS, 3
 """An edge reports for 15 s that it sent pictures, 3 at least, of which none came. A keyframe is coded for less than a
 second of the rate: it takes that long on a link of a fifteenth of it."""
+_OVERDUE_NS = 4 * SECOND_NS
+"""After this time without the keyframe of a session the edge is told so: it still has the pictures of 5 s."""
 _AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""
 
@@ -59,6 +64,47 @@ class Packet:
         if isinstance(self.header, PoseReport):
             return self.header.is_of(session_id)
         return self.header.session_id == session_id
+
+
+@dataclass(slots=True)
+class Unseen:
+    """A session that is not open although its edge sends pictures, from its first report on."""
+
+    first: Status
+    since_ns: int
+    came: set[bool] = field(default_factory=set)
+    """Whether access units of the edge came: True for a keyframe, False for another."""
+    lost: int = 0
+    """Pictures that the edge is to be told of; 0 while the first may be under way."""
+
+    def note(self, status: Status, now_ns: int) -> bool:
+        """Take a further report of the edge; whether its keyframes have not come for long."""
+        sent, first = status.base_messages - self.first.base_messages, self.first.health.keyframes
+        if self.came and status.health.keyframes == first:
+            sent = 0  # who joins between two keyframes waits for the next one
+        lasts_ns = now_ns - self.since_ns
+        self.lost = sent if lasts_ns >= _OVERDUE_NS else 0
+        return lasts_ns >= _UNSEEN_NS and sent >= _UNSEEN and True not in self.came
+
+    def feedback(self, **of_receiver: Any) -> Feedback:
+        """The report of a ground that waits: nothing of the session can be shown."""
+        return Feedback(
+            session_id=self.first.session_id,
+            last_frame_index=-1,
+            base_messages=0,
+            base_bytes=0,
+            roi_messages=0,
+            roi_bytes=0,
+            lost=self.lost,
+            corrupt=0,
+            base_sequence=-1,
+            base_held_us=0,
+            still_sequence=-1,
+            missing_stills=(),
+            delay_p50_ms=-1.0,
+            stills=(),
+            **of_receiver,
+        )
 
 
 class Uptime:
@@ -111,9 +157,8 @@ class Receiver:
             PoseReport: deque(maxlen=_MOST_HELD),
             RoiHeader: deque(maxlen=_MOST_HELD),
         }
-        self._unseen: tuple[tuple[int, int], int, int] | None = None
-        """The first report since a picture came: its session and how many pictures had come damaged, how many were
-        sent by then, and when the report came."""
+        self.unseen: Unseen | None = None
+        """The session of the newest report, if it is not open."""
         self._uptime = Uptime()
         self._captures = CaptureTimes()
         self._last_message_ns = time.monotonic_ns()
@@ -142,7 +187,8 @@ class Receiver:
             match message:
                 case BaseHeader():
                     self._captures.note(message)
-                    self._unseen = None
+                    if self.unseen is not None:
+                        self.unseen.came.add(bool(message.flags & Flags.KEYFRAME))
                     return self.stream.accept(message, item, now_ns=at_ns)
                 case RoiHeader():
                     otherwise_ns = item.received_ns - message.send_delay_ns
@@ -170,17 +216,13 @@ class Receiver:
         self.stream.keyframe_requested(at_ns)
         return True
 
-    def is_unseen(self, status: Status | None, now_ns: int) -> bool:
-        """Whether the edge has said for long that it sends pictures of which none comes; None: it says nothing."""
-        of = None if status is None else (status.session_id, self.stream.counters.corrupt)
-        if status is None or status.state == "ended" or (self._unseen is not None and self._unseen[0] != of):
-            self._unseen = None
-        if status is None or of is None:
-            return False
-        if self._unseen is None:
-            self._unseen = of, status.base_messages, now_ns
-        _, sent, since_ns = self._unseen
-        return now_ns - since_ns >= _UNSEEN_NS and status.base_messages - sent >= _UNSEEN
+    def is_unseen(self, status: Status, now_ns: int) -> bool:
+        """Whether the edge has said for long that it sends pictures of a session of which no keyframe comes."""
+        if status.state == "ended":
+            self.unseen = None
+        elif self.unseen is None or self.unseen.first.session_id != status.session_id:
+            self.unseen = Unseen(status, now_ns)
+        return self.unseen is not None and self.unseen.note(status, now_ns)
 
     def hold(self, packet: Packet) -> None:
         """Hold a still, a pose, or the first report of a session: it may overtake the keyframe that begins it."""

@@ -43,6 +43,8 @@ _log = logging.getLogger(__name__)
 _INFO_TRIES = 3
 _BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After a pause of chunks this long the recording says how much of the backlog came."""
+_UNSEEN_EVERY_NS = SECOND_NS // 2
+"""Between two reports that no keyframe comes."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
 """Time between two queries of the edge's clock."""
 _NO_PICTURE = (
@@ -100,7 +102,7 @@ class EdgeSessions:
         """The session that ended as its edge was gone: only its stored objects may still come."""
         self._backlog_ns: int | None = None
         """When the last chunk of it came that nothing has been said of."""
-        self._next_clock_ns = 0
+        self._next_clock_ns = self._next_unseen_ns = 0
         self.session: Session | None = None
         """The one that is open."""
         self.ended = 0
@@ -204,8 +206,12 @@ class EdgeSessions:
                 session.note("warning", "the ground has asked for a keyframe")
         if session is not None:
             self._serve(session, now_ns)
-        elif self.receiver.silent_ns > self._patience_ns:
-            self._say_unseen(_NO_PICTURE if self.receiver.is_unseen(None, now_ns) else "")
+        waits = self.receiver.unseen
+        if waits is not None and self.receiver.silent_ns > self._patience_ns:
+            self._shows_or_ended()
+        elif waits is not None and waits.lost and now_ns >= self._next_unseen_ns:
+            self._next_unseen_ns = now_ns + _UNSEEN_EVERY_NS
+            self._reports.send(waits.feedback)
 
     def _serve(self, session: Session, now_ns: int) -> None:
         if session.take_resumed():
@@ -261,9 +267,10 @@ class EdgeSessions:
 
     def _route(self, packet: Arrival[Received] | Packet) -> None:
         if isinstance(packet, Arrival):
-            self.failures.works(self._video)
-            self._unseen_failure = 0
             self._base(packet)
+            if self.session is not None:  # else it is of no use yet
+                self.failures.works(self._video)
+                self._unseen_failure = 0
             return
         session, header, item = self.session, packet.header, packet.item
         row = item.key.rpartition("/")[2]
@@ -278,7 +285,9 @@ class EdgeSessions:
                 isinstance(header, RoiHeader) and session is None
             ):
                 self.receiver.hold(packet)  # it may overtake the first keyframe of its session
-                if isinstance(header, Status) and session is None:
+                # An edge that was restarted may be heard, and not seen, while its former session is still open.
+                alone = session is None or session.reception.health(self._clock()) is None
+                if isinstance(header, Status) and alone:
                     self._say_unseen(_NO_PICTURE if self.receiver.is_unseen(header, item.received_ns) else "")
             elif isinstance(header, TrackStep) and session is None:
                 pass  # who joins between two keyframes gets some; the next ones say all of it again
@@ -286,6 +295,10 @@ class EdgeSessions:
                 self.receiver.skip_stranger(row, header.session_id)
         except WireError as error:
             self.receiver.skip(row, error)
+
+    def _shows_or_ended(self) -> None:
+        self.receiver.unseen = None
+        self._say_unseen("")
 
     def _say_unseen(self, reason: str) -> None:
         if not reason:
@@ -365,6 +378,7 @@ class EdgeSessions:
         log_fields(session=f"{info.session_id:08x}")
         self.session = self._open_session(info, self._reports)
         self.session.reception.counters = self.receiver.stream.counters
+        self.receiver.unseen = None
         self.failures.works(self._part)
         for packet in self.receiver.take_held():
             self._route(packet)

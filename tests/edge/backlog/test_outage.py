@@ -66,6 +66,20 @@ def test_a_link_that_passes_small_messages_alone_is_an_outage():
     assert not outage.offline(40 * S, linked=True), "a camera that gives nothing has no news"
 
 
+def test_a_ground_that_never_saw_a_picture_is_told_from_one_that_takes_none():
+    """In a black hole of large packets from the start the whole flight was sent in vain, and nothing was kept."""
+    outage, away = Outage(live=True), []
+    for number in range(20):
+        outage.reported(number * S // 2, sent=number, misses_video=number >= 8)
+        outage.reported(number * S // 2, sent=number)  # a program that takes tracks alone
+        away.append(outage.offline(number * S // 2, linked=True))
+    assert not any(away[:8])
+    assert all(away[8 + 10 :])
+    outage.reported(10 * S, named=20, sent=20)
+    outage.reported(10 * S, sent=20, misses_video=True)
+    assert not outage.offline(10 * S, linked=True), "another ground has the video"
+
+
 def test_a_pause_of_the_camera_is_no_outage_whatever_was_lost_before_it():
     """After a pause the first frames would be stored, not seen: the last one before it was lost."""
     outage = Outage(live=True)

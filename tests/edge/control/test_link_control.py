@@ -8,6 +8,7 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController
 from rigs.keeping import Rig
+from rigs.messages import feedback
 
 SECOND_NS = 1_000_000_000
 
@@ -75,6 +76,27 @@ def test_a_forged_number_of_a_still_in_a_report_takes_none_for_received(rig):
     assert rig.outbox.unacknowledged == 1
     rig.report()
     assert rig.outbox.unacknowledged == 0
+
+
+@pytest.mark.parametrize("rig", [{"adapt": True}], indirect=True)
+def test_a_ground_that_hears_and_misses_video_is_said_and_stored_for(rig):
+    """Beyond a hole for large packets the edge would send the flight in vain, at its full rate, and be content."""
+    waits = replace(
+        feedback(lost=9, missing_stills=(), backlog=()), session_id=7, base_sequence=-1, still_sequence=-1
+    )
+    rig.out.dark = True
+    rig.play(0, 15)
+    for first in range(15, 195, 15):
+        said = replace(waits, sequence=first, send_ns=rig.now_ns)
+        rig.link_control.on_feedback(said)
+        rig.play(first, first + 15)
+    assert rig.backlog.frames >= 120
+    (failed,) = rig.failures.now
+    assert failed.part == "pictures"
+    assert "large packets are lost" in failed.reason
+    rig.out.dark = False
+    rig.play(195, 210, reports=True)
+    assert not rig.failures.now
 
 
 @pytest.mark.parametrize("rig", [{"adapt": True, "inbox": Faulty()}], indirect=True)

@@ -72,6 +72,17 @@ def test_of_two_healthy_grounds_one_steers(fps, held, lost, delay_s):
     assert changes == 0
 
 
+def test_two_grounds_that_see_nothing_do_not_take_turns():
+    """At each turn the edge forgot what it knew of the path: it never held back, nor asked for a keyframe."""
+    primary, now_ns = PrimaryReceiver(), 0
+    for number in range(20):
+        for one in (1, 2):
+            said = feedback(receiver_id=one, sequence=number, base_sequence=-1, still_sequence=-1, lost=9)
+            now_ns += S // 4
+            assert primary.judge(said, sent=SENT, now_ns=now_ns).primary == (one == 1)
+    assert judged(primary, 3, 0, now_ns=now_ns, base=20) == "first", "one that has the video takes over"
+
+
 def test_who_reports_and_receives_nothing_makes_way_at_any_frame_rate():
     """A ground whose picture has stopped would steer for all the others."""
     for fps in (1, 5, 15):

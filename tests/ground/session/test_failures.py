@@ -147,6 +147,8 @@ def test_an_edge_of_which_all_but_the_pictures_comes_is_named(flight, tmp_path, 
             break
     assert rig.second == (16 if sends else 17), "a camera that gives nothing is no black hole"
     assert ("video of uav-1 FAILED at" in rig.said) == sends
+    told = [(one.session_id, one.base_sequence, one.misses_video) for one in rig.port.reports]
+    assert set(told) == ({(flight.session_id, -1, True)} if sends else set()), "the edge stores from then on"
     assert all("only small messages come" in one.reason for one in rig.sessions.failures.now)
     rig.put(0, 1)
     assert "FAILED" not in rig.said

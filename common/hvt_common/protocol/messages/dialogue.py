@@ -151,7 +151,8 @@ class Feedback(Message):
     roi_messages: int = wire_field(_COUNT)
     roi_bytes: int = wire_field(_COUNT)
     lost: int = wire_field(_COUNT)
-    """Messages of base that were not received, or not before they were sent again."""
+    """Messages of base that were not received, or not before they were sent again; while a ground waits for the first
+    keyframe of the session, all that the edge says it has sent."""
     corrupt: int = wire_field(_COUNT)
     """Messages of base that came damaged."""
     base_sequence: int = wire_field(Int(-1, U32))
@@ -180,6 +181,11 @@ class Feedback(Message):
     missing_base: tuple[int, ...] = wire_field(ListOf(Int(0, U32), MAX_MISSING_BASE), default=())
     """Sequences of ``base`` behind which newer ones wait; the edge may send each again. None where they are more: a
     keyframe is the shorter way then."""
+
+    @property
+    def misses_video(self) -> bool:
+        """Whether pictures were sent to it and none could be shown: a ground that takes no video misses none."""
+        return self.base_sequence < 0 and self.lost > 0
 
     @property
     def lost_so_far(self) -> int:
