@@ -407,6 +407,25 @@ def test_an_mp4_whose_index_cannot_be_reached_says_how_it_can(tmp_path, recordin
     assert "without HTTP ranges plays an MP4 whose index (moov) comes first (+faststart)" in said
 
 
+def test_an_mp4_whose_index_comes_last_is_played_from_its_first_frame(tmp_path):
+    """The first keyframe was lost, and with it all up to the next, without a word."""
+    data = write_numbered(tmp_path / "a.mp4", codec="mjpeg", pixels="yuvj420p").read_bytes()
+
+    def answer(handler):
+        begin = int(handler.headers["Range"].strip("bytes=-"))
+        handler.protocol_version = "HTTP/1.1"
+        handler.close_connection = handler.headers["Connection"] == "close"  # without a word
+        handler.send_response(206)
+        handler.send_header("Content-Range", f"bytes {begin}-{len(data) - 1}/{len(data)}")
+        handler.send_header("Content-Length", str(len(data) - begin))
+        handler.end_headers()
+        handler.wfile.write(data[begin:])
+
+    with served(answer) as url:
+        _, frames = play(f"{url}/a.mp4", fps=30)
+    assert numbers(frames) == list(range(60))
+
+
 @pytest.mark.parametrize("step_s", [-3600, 3600])
 def test_a_clock_that_is_set_neither_stops_a_camera_nor_dates_it_anew(recording, monkeypatch, step_s):
     """NTP would silence the camera for as long as the clock was ahead, or put an hour into the recording."""

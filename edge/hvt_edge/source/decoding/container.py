@@ -51,8 +51,14 @@ _MOST_BOXES = 2**16
 """Nine hours of fragments, a second each."""
 DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
 """A sender of MPEG-TS that begins anew may number its film otherwise: it is the same film to a viewer."""
-_FILE_OPTIONS = {**DEMUX_OPTIONS, "live_start_index": "0", "m3u8_hold_counters": "3"}
-"""An HLS playlist whose recorder has ended is read from its beginning, and polled thrice for more."""
+_FILE_OPTIONS = {
+    **DEMUX_OPTIONS,
+    # An HLS playlist whose recorder has ended is read from its beginning, and polled thrice for more.
+    "live_start_index": "0",
+    "m3u8_hold_counters": "3",
+    # Else FFmpeg asks on a line that the server has closed, and leaves out the frame that it wanted there.
+    "multiple_requests": "1",
+}
 _PLAYLIST, _IN_SEGMENTS = ".m3u8", "hls"
 _WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
