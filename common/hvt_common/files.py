@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import BinaryIO
 
 MOST_BYTES = 16_000_000
 MOST_TABLE_BYTES = 1_000_000_000
@@ -41,6 +42,15 @@ def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
     if len(content) > most:
         raise OSError(errno.EFBIG, f"larger than {most / 1e6:g} MB")
     return content
+
+
+def open_plain(path: Path) -> BinaryIO:
+    """A file, to be read from any place. Raises `OSError`, also for a pipe, which keeps its reader waiting."""
+    file = open(path, "rb", opener=at_once)  # noqa: SIM115 - it is the caller's
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.ESPIPE, "a pipe or a device, and no file")
+    return file
 
 
 def at_once(path: str, flags: int) -> int:

@@ -22,6 +22,7 @@ from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer, of_fil
 from hvt_archive.reading.readable import has_holes, id_of, readable, what_is_read
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_common.errors import UserError, telling
+from hvt_common.files import open_plain
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
 from hvt_common.video.hevc import BaseDecoder, is_keyframe
 from hvt_ground.events import VEHICLE, Notice, Overlay, PoseUpdate, VideoSample
@@ -162,7 +163,7 @@ def readable_part(path: Path, *, done: str) -> Iterator[tuple[Path, bool]]:
         UserError: it cannot be read, or is no recording.
     """
     with telling(f"recording {path} cannot be read (", "): give .rrd files of hvt-ground"):
-        path.open("rb").close()
+        open_plain(path).close()
     with tempfile.TemporaryDirectory() as folder:
         try:
             (name := Path(folder) / "named.rrd").symlink_to(path.absolute())  # Rerun takes UTF-8 alone

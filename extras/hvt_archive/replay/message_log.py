@@ -21,7 +21,7 @@ from typing import BinaryIO
 import msgpack
 
 from hvt_common.errors import UserError, telling
-from hvt_common.files import check_there
+from hvt_common.files import check_there, open_plain
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
 from hvt_common.runtime.statistics import Newest
@@ -129,7 +129,7 @@ def read_log(path: Path) -> Iterator[Received]:
     """
     with (
         telling(f"message log {path} cannot be read (", "): give one of hvt-ground --log"),
-        path.open("rb") as file,
+        open_plain(path) as file,
     ):
         if file.read(len(_MAGIC)) != _MAGIC:
             raise UserError(f"{path} is no message log of hvt-ground --log")

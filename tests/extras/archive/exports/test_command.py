@@ -410,6 +410,7 @@ def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
         ("{wrong} --to mp4", "wrong.rrd is no recording"),
         ("{foreign} --to mp4", "foreign.rrd is no recording"),
         ("{absent} --to mp4", "absent.rrd cannot be read (No such file or directory): give .rrd files"),
+        ("{here}/pipe --to csv", "pipe cannot be read (a pipe or a device, and no file): give .rrd files"),
         ("{here} --to csv", f"{tmp_path} cannot be read (Is a directory): give .rrd files"),
         ("{good}", "--to is missing: give one of mp4, mkv, ts"),
         ("{good} --to avi", "'avi'"),

@@ -1,6 +1,7 @@
 """The log of messages: what was written is read back, whatever happened to the file."""
 
 import itertools
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -129,6 +130,9 @@ def test_what_is_no_log_is_said(tmp_path):
         list(read_log(wrong))
     with pytest.raises(UserError, match="No such file"):
         list(read_log(tmp_path / "absent.hvtlog"))
+    os.mkfifo(pipe := tmp_path / "pipe")  # it waited for ever
+    with pytest.raises(UserError, match="a pipe or a device, and no file"):
+        list(read_log(pipe))
 
 
 def test_a_full_disk_leaves_whole_records(tmp_path):
