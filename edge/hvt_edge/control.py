@@ -14,6 +14,7 @@ from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
+from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, least_budget_bps, stream_text
@@ -76,6 +77,8 @@ class Commands:
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._request_times: deque[int] = deque(maxlen=_MOST_REQUESTS)
+        self._answered: Newest[int, ControlAnswer] = Newest(_MOST_REQUESTS)
+        """By the number of the request."""
         self._changed_ns: int | None = None
         self._commands: dict[str, Callable[[Arguments], ControlAnswer]] = {
             Command.KEYFRAME: self._keyframe,
@@ -89,11 +92,16 @@ class Commands:
 
     def answer(self, request: ControlRequest) -> ControlAnswer:
         """Obey the request or give the reason why not; never raises, whatever a ground sends."""
-        try:
-            with self._lock:
-                return self._obey(request)
-        except (RefusedError, UserError) as refusal:
-            return self._answer(reason=str(refusal))
+        with self._lock:
+            answer = self._answered.get(request.request_id)
+            if answer is None:
+                try:
+                    answer = self._obey(request)
+                except (RefusedError, UserError) as refusal:
+                    answer = self._answer(reason=str(refusal))
+            if request.request_id:
+                self._answered[request.request_id] = answer
+            return answer
 
     def _answer(
         self,

@@ -13,6 +13,7 @@ while one is waited for.
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
@@ -277,7 +278,9 @@ class RemoteEdge:
     ) -> ControlAnswer | None:
         # The answer where that session accepts; None where there is none in time. Others refuse.
         try:
-            question = ControlRequest(session_id=session_id, command=command, arguments=arguments).pack()
+            question = ControlRequest(
+                session_id=session_id, command=command, arguments=arguments, request_id=secrets.randbits(64)
+            ).pack()
         except ValueError as error:
             raise UserError(f"{command}: {error}") from None
 

@@ -146,6 +146,19 @@ def test_a_request_whose_answer_was_lost_is_the_same_still():
     assert rig.ask("still", track=5).still_request == first.still_request + 2, "another look"
 
 
+def test_a_repeated_question_is_obeyed_once_also_when_its_still_has_gone_out():
+    """The repetition of a question whose answer was lost cost a second still; a budget that was set was refused."""
+    rig = Rig("150kbps", share=0.9)
+    rig.run(30)
+    still = ControlRequest(session_id=0, command="still", arguments={"track": 5}, request_id=7)
+    first = rig.commands.answer(still)
+    rig.run(150)
+    assert (rig.commands.answer(still), len(rig.asked())) == (first, 1)
+    budget = ControlRequest(session_id=0, command="set-budget", arguments={"bps": 120_000}, request_id=8)
+    assert all(rig.commands.answer(budget).accepted for _ in range(2))
+    assert rig.commands.answer(replace(still, request_id=9)).still_request == first.still_request + 1
+
+
 def test_the_same_request_while_its_still_goes_out_is_answered():
     """The thread of stills takes the crop away between two looks at it, and the answer would be an error."""
     rig = Rig("150kbps", share=0.9)

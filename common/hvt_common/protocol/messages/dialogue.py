@@ -76,11 +76,16 @@ class InfoRequest(Message):
 class ControlRequest(Message):
     """Payload of a question on ``control``."""
 
+    TRIMMED: ClassVar[bool] = True
+
     session_id: int = wire_field(Int(0, U64))
     """The session it is meant for; 0 for whichever runs."""
     command: str = wire_field(Text(24))
     """A `Command`, or a word of some later version."""
     arguments: Mapping[str, int | float | str] = wire_field(MapOf(Scalar(), 8, key_bytes=16))
+    request_id: int = wire_field(Int(0, U64), default=0)
+    """Random: a question of the same number is the same, repeated since its answer may be lost, and is obeyed once.
+    0: each is obeyed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
