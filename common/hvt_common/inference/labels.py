@@ -171,7 +171,7 @@ def _read_text(path: Path) -> str:
 
 def _written_names(text: str) -> tuple[str, ...] | None:
     text = text.strip()
-    if not text or len(text) > _MAX_METADATA_CHARS:
+    if text in ("", "null", "None") or len(text) > _MAX_METADATA_CHARS:
         return None
     plain = _PLAIN_LIST.fullmatch(text)
     if plain or text[0] not in "[{(":
@@ -187,8 +187,8 @@ def _written_names(text: str) -> tuple[str, ...] | None:
 
 def _unquoted(text: str) -> dict[str, str]:
     # A table as YAML and others write it: ``{0: car, 1: bus}``. `ValueError` for anything else.
-    pairs = [re.fullmatch(r"\s*(\d+)\s*[:=]\s*([^:=]+?)\s*", one) for one in text.strip("{}").split(",")]
-    if not all(pairs):
+    pairs = [re.fullmatch(r"\s*(\d+)\s*[:=]\s*([^][{}'\":=]+?)\s*", one) for one in text[1:-1].split(",")]
+    if text[-1] != "}" or not all(pairs):
         raise ValueError(text)
     return {pair[1]: pair[2] for pair in pairs if pair}
 
@@ -206,7 +206,8 @@ def _names(value: object) -> tuple[str, ...] | None:
     if any(isinstance(item, dict | list | tuple) for item in value):
         return None
     # ``?`` stands for characters that no terminal, table or message can hold.
-    plain = (shown_text(str(item)[:MAX_LABEL_CHARS]).replace("\n", "?") for item in value)
+    known = ("" if item is None else str(item)[:MAX_LABEL_CHARS] for item in value)
+    plain = (shown_text(item).replace("\n", "?").strip() for item in known)
     return tuple(name or f"class {number}" for number, name in enumerate(plain))
 
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from hvt_common.errors import UserError
 from hvt_common.inference.heads.contract import Array, HeadOutput, best, rows_of, valid
 from hvt_common.values import Boxes
 
@@ -74,12 +75,17 @@ class Parallel:
     def __call__(
         self, outputs: Sequence[Array], *, confidence: float, input_size: tuple[int, int]
     ) -> HeadOutput:
-        """Rows beyond the count are padding."""
+        """Rows beyond the count are padding. `UserError` for a class below the first: all others have wrong names."""
         boxes, scores, kinds = outputs[0].reshape(-1, 4), outputs[1].ravel(), outputs[2].ravel()
         count = min(len(boxes), len(scores), len(kinds))
         if len(outputs) > 3 and outputs[3].size and np.isfinite(outputs[3].flat[0]):
             count = min(count, max(0, int(outputs[3].flat[0])))
         picked = np.flatnonzero(scores[:count] >= confidence)
+        if self.first_class and (kinds[picked] == self.first_class - 1).any():
+            raise UserError(
+                f"lists class {self.first_class - 1}, and its classes are taken to count from {self.first_class}: add"
+                " 1 to them in its graph"
+            )
         pixels = _pixels(_corners(boxes[picked], self.form), input_size)
         return valid(pixels, scores[picked], kinds[picked] - self.first_class, confidence)
 

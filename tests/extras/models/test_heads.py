@@ -343,6 +343,21 @@ def test_names_that_lack_the_background_name_nothing(tmp_path: Path, family: str
         opened(path).detect(picture())
 
 
+def test_lists_of_tensorflow_that_count_from_0_name_nothing(tmp_path: Path) -> None:
+    """Its first class was left out as the background, and each other had the name of the one before."""
+    graph = Graph()
+    boxes, scores = graph.find("images", top=255)
+    lists = {
+        "detection_boxes": graph.batch(
+            graph.op("Gather", graph.shares(boxes), graph.ints(1, 0, 3, 2), axis=1)
+        ),
+        "detection_scores": graph.batch(scores),
+        "detection_classes": graph.const([[0.0, 1.0]]),
+    }
+    with pytest.raises(UserError, match="lists class 0, and its classes are taken to count from 1: add 1"):
+        opened(write(tmp_path / "m.onnx", graph, lists)).detect(picture())
+
+
 def test_a_background_among_the_names_of_tensorflow_shifts_none(tmp_path: Path) -> None:
     """Its classes begin at 1, and were called by the name before: the first one "background"."""
     names = {"names": "['__background__', 'red', 'blue']"}
