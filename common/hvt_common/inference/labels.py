@@ -177,11 +177,11 @@ def _written_names(text: str) -> tuple[str, ...] | None:
     if plain or text[0] not in "[{(":
         names = [name.strip() for name in re.split(r"[,\n]", plain[1] if plain else text) if name.strip()]
         names = list(_without_numbers(names))
-        return _names(names) if all(map(_NAME.fullmatch, names)) else None
+        return table_names(names) if all(map(_NAME.fullmatch, names)) else None
     for read in (ast.literal_eval, json.loads, _unquoted):
         # Not a literal; or a key that is a list, or a number that is too long to print.
         with suppress(ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-            return _names(read(text))
+            return table_names(read(text))
     return None
 
 
@@ -193,7 +193,11 @@ def _unquoted(text: str) -> dict[str, str]:
     return {pair[1]: pair[2] for pair in pairs if pair}
 
 
-def _names(value: object) -> tuple[str, ...] | None:
+def table_names(value: object) -> tuple[str, ...] | None:
+    """Class names of a list, or of a table by number; None for anything else, and where a name is no word.
+
+    A name is one line that a terminal can hold; one that is empty or missing is "class" and its number.
+    """
     if isinstance(value, dict):
         if set(value.values()) == set(range(len(value))):  # by name, as Keras has them
             value = {number: name for name, number in value.items()}
@@ -205,7 +209,6 @@ def _names(value: object) -> tuple[str, ...] | None:
         return None
     if any(isinstance(item, dict | list | tuple) for item in value):
         return None
-    # ``?`` stands for characters that no terminal, table or message can hold.
     known = ("" if item is None else str(item)[:MAX_LABEL_CHARS] for item in value)
     plain = (shown_text(item).replace("\n", "?").strip() for item in known)
     return tuple(name or f"class {number}" for number, name in enumerate(plain))

@@ -27,7 +27,8 @@ import numpy as np
 
 from hvt_common import files
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import numbered_names, read_labels
+from hvt_common.inference.labels import read_labels, table_names
+from hvt_common.units import shown_text
 from hvt_common.values import Image
 from hvt_edge.source.folder import read_picture, sequence_files
 from hvt_study.datasets.annotation_rows import label_text
@@ -42,10 +43,19 @@ _LABELS = (
     *(("labels", ".txt"), ("annotations", ".txt")),
     *(("Annotations", ".xml"), ("annotations", ".xml"), ("labels", ".xml")),
 )
-_OTHER = {"annotations.xml": "CVAT for images", "label_2": "KITTI", "labelTxt": "DOTA", "ann": "Supervisely"}
-_OTHER_FILES = (".json", ".csv", ".odgt", ".xml")
+_OTHER = {
+    "annotations.xml": "CVAT for images",
+    "label_2": "KITTI",
+    "labelTxt": "DOTA",
+    "ann": "Supervisely",
+    "groundtruth.txt": "LaSOT or GOT-10k",
+    "groundtruth_rect.txt": "OTB",
+    "gt.txt": "a sequence",
+}
+_OTHER_FILES = (".json", ".jsonl", ".ndjson", ".csv", ".odgt", ".xml")
 _OTHER_WORDS = re.compile(
-    rb"bbox|xmin|x_min|box2d|gtboxes|shape_attributes|rectanglelabels|\"(?:shapes|annotations)\""
+    rb"bbox|bounding_?box|x_?min|box2d|gtboxes|shape_attributes|rectanglelabels|<box |\"(?:shapes|annotations)\"",
+    re.IGNORECASE,
 )
 """In the first bytes of files that hold labels of a kind that is not read."""
 _LOOKED_AT = 65536
@@ -133,7 +143,7 @@ def check_strange(place: Path, pictures: Sequence[Path]) -> None:
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() in _OTHER_FILES and file.is_file():
                 with suppress(OSError), file.open("rb") as opened:
-                    if _OTHER_WORDS.search(opened.read(_LOOKED_AT)):
+                    if _OTHER_WORDS.search(opened.read(_LOOKED_AT).replace(b"\0", b"")):
                         strange.append((file, "labels, it seems"))
     for path, what in strange:
         if path.exists():
@@ -157,7 +167,7 @@ def read_class_file(path: Path) -> tuple[str, ...]:
     """Names one a line, or ``names`` of YOLO's YAML, a list or a table by number; `UserError` where none is."""
     if path.suffix not in YAML:
         return read_labels(path)
-    names = _yaml_names(path)
+    names = table_names(_read_yaml(path).get("names"))
     if not names:
         raise UserError(f"{path} has no class names; accepted is names: with a list, or a table by number")
     return names
@@ -250,14 +260,6 @@ def _instead(root: Path, parts: tuple[str, ...], folder: str, suffix: str) -> It
     yield root.joinpath(folder, *parts).with_suffix(suffix)
 
 
-def _yaml_names(path: Path) -> tuple[str, ...]:
-    names = _read_yaml(path).get("names", ())
-    if not isinstance(names, dict):
-        return tuple(_words(names) if isinstance(names, list) else ())
-    numbers = {int(key): str(name) for key, name in names.items() if re.fullmatch(r"\d{1,6}", str(key))}
-    return numbered_names(numbers) if len(numbers) == len(names) else ()
-
-
 @dataclass(frozen=True, slots=True)
 class VocFile:
     """One file."""
@@ -294,6 +296,11 @@ def read_voc(path: Path) -> VocFile:
             for one in root.iter("object")
         ),
     )
+
+
+def class_word(name: object) -> str:
+    """The name of a class on one line that a terminal can hold; empty where there is none."""
+    return shown_text(" ".join(str(name or "").split()))
 
 
 def number_of(text: str | None, *, missing: float = 0.0) -> float:

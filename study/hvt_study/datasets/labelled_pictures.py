@@ -198,7 +198,7 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
     """COCO's ``images``, ``annotations`` (also ``annotation``) and ``categories``."""
     try:
         about = json.loads(label_text(path))
-        categories = [(_id(row["id"]), str(row["name"] or "")) for row in about["categories"]]
+        categories = [(_id(row["id"]), label_files.class_word(row["name"])) for row in about["categories"]]
         names = dict(categories)
         unclear_names = {key for key, name in categories if names[key] != name}
         rows = about["annotations"] if "annotations" in about else about["annotation"]
@@ -260,7 +260,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _id(value: Any) -> Any:
-    """A number is one also where a tool writes it as text."""
+    """A number is one also where a tool writes it as text; a list or a table is none."""
+    if isinstance(value, list | dict):
+        return None
     return int(value) if isinstance(value, str) and value.isdecimal() else value
 
 

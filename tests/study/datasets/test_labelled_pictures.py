@@ -280,6 +280,7 @@ def test_a_picture_that_is_not_there_is_called_so(tmp_path):
         ('names: {0: car, 2: "bus"}  # two\nnc: 2\n', ("car", "class 1", "bus")),
         ('"names": ["car",  # first\n  "bus"]\n', NAMES),
         ("names: &all\n- 'it''s'\n- bus #2\n", ("it's", "bus")),
+        ('names: {0: , 1: "bus\\e[31m"}\n', ("class 0", "bus?[31m")),
         *(
             (bad, None)
             for bad in ("names: [car", "names: *nobody\n", "a: 1\n---\nnames: [car]\n", "[" * 5000)
@@ -328,6 +329,12 @@ REFUSED = [
     ({"images/_annotations.csv": "filename,width,height,class,xmin,ymin,xmax,ymax"}, UNREAD),
     ({"val.json": '[{"name": "a.jpg", "labels": [{"box2d": {}}]}]'}, UNREAD),
     ({"val.odgt": '{"ID": "a", "gtboxes": []}'}, UNREAD),
+    ({"gt.txt": "1,1,20,10,40,40,car"}, UNREAD),
+    ({"groundtruth.txt": "20,10,40,40"}, UNREAD),
+    ({"boxes.csv": "ImageID,LabelName,XMin,XMax,YMin,YMax"}, UNREAD),
+    ({"boxes.csv": ("filename;xmin;ymin;xmax;ymax;class", "utf-16")}, UNREAD),
+    ({"train.jsonl": '{"image": "a.jpg", "bbox": [1, 2, 3, 4]}'}, UNREAD),
+    ({"vott.json": '{"regions": [{"boundingBox": {}}]}'}, UNREAD),
     ({"via.json": '{"a.jpg1": {"regions": [{"shape_attributes": {}}]}}'}, UNREAD),
     # Of labels in pixels nothing is right; of classes from 1, each would be the next one, and the last left out.
     (
@@ -435,7 +442,7 @@ def test_what_coco_says_of_classes_and_crowds_counts(tmp_path):
         rows = about["annotations"]
         rows[1]["ignore"] = 1
         about["categories"] += [{"id": 7, "name": None}, {"id": 8, "name": "car"}, {"id": 8, "name": "van"}]
-        rows += [{**rows[0], "id": kind, "category_id": kind} for kind in (7, 8)]
+        rows += [{**rows[0], "id": kind, "category_id": kind} for kind in (7, 8, [9])]
 
     lay(tmp_path, "a.jpg", **{"labels.json": coco(box=[100, 10, 20, 20], change=change)})
     ((one, labels),) = read(tmp_path)
@@ -443,7 +450,7 @@ def test_what_coco_says_of_classes_and_crowds_counts(tmp_path):
     assert labels.beside_xyxy_px.tolist() == [[100, 10, 120, 30]]
     assert not len(labels.ignored_xyxy_px), "pycocotools counts what stands before a crowd"
     assert labels.passed_xyxy_px.tolist() == [[100, 10, 120, 30]], "it would be taught as background"
-    assert "2 labels were left out" in doubts_of([one])[0]
+    assert "3 labels were left out" in doubts_of([one])[0]
 
 
 def test_a_sensors_levels_are_shown_as_the_edge_shows_them(tmp_path):
