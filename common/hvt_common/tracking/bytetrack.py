@@ -122,6 +122,11 @@ class ByteTracker:
         """The newest frame that another scene began with, where the camera is followed; -1 before any."""
         return self._pictures.scene_began
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no object is tracked or remembered."""
+        return not len(self._table)
+
     def is_due(self, frames: int, *, every: int, most: int) -> bool:
         """Whether to search the newest frame, which is ``frames`` after the last searched one.
 

@@ -15,6 +15,8 @@ from hvt_common.values import Detections, Tracks
 from hvt_study.datasets.annotation_rows import LAST_FRAME, Rows, read_rows
 
 _MOT = "frame,id,x,y,w,h,score"
+_REMEMBERED = 3
+"""Frames without detections after which the tracker, where it tracks nothing, is as after any more of them."""
 
 
 def read_detections(path: Path) -> Rows:
@@ -35,10 +37,11 @@ def read_detections(path: Path) -> Rows:
     return rows
 
 
-def detections_by_frame(rows: Rows) -> Iterator[tuple[int, Detections]]:
-    """Every frame from 1 (or 0, where the file begins there) to the last, also those without detections.
+def tracked(tracker: ByteTracker, rows: Rows) -> Iterator[Tracks]:
+    """The tracks of frames from 1 (or 0, where the file begins there) to the last, also of those without detections.
 
-    Boxes become x1 y1 x2 y2 float32 in the order of the file; all classes are 0, which the format does not know.
+    While nothing is tracked only the last `_REMEMBERED` frames before the next detection are gone through. Boxes
+    become x1 y1 x2 y2 float32 in the order of the file; all classes are 0, which the format does not know.
     """
     if not len(rows):
         return
@@ -46,17 +49,23 @@ def detections_by_frame(rows: Rows) -> Iterator[tuple[int, Detections]]:
     frames, xywh = table[:, 0], table[:, 2:6]
     boxes = np.concatenate((xywh[:, :2], xywh[:, :2] + xywh[:, 2:]), axis=1).astype(np.float32)
     scores = table[:, 6].astype(np.float32)
-    first, last = min(1, int(frames[0])), int(frames[-1])
-    bounds = np.searchsorted(frames, np.arange(first, last + 2))
-    for frame in range(first, last + 1):
-        part = slice(bounds[frame - first], bounds[frame - first + 1])
-        yield frame, Detections(boxes[part], scores[part], np.zeros(len(scores[part]), np.int32))
+    here, starts = np.unique(frames, return_index=True)
+    frame = int(min(1, frames[0]))
+    for found, start, end in zip(here.tolist(), starts, [*starts[1:], len(frames)], strict=True):
+        while frame < found:
+            if tracker.is_empty:
+                frame = max(frame, int(found) - _REMEMBERED)
+            yield tracker.update(Detections.none(), frame_index=frame)
+            frame += 1
+        seen = Detections(boxes[start:end], scores[start:end], np.zeros(end - start, np.int32))
+        yield tracker.update(seen, frame_index=frame)
+        frame += 1
 
 
 def rows_of_tracks(tracks: Iterable[Tracks]) -> npt.NDArray[np.float64]:
     """(N, 7) ``frame,id,x,y,w,h,score`` of all boxes of frames, by frame and then by id."""
     rows = [np.empty((0, 7))]
-    for each in filter(len, tracks):  # of the millions of frames between two detections nothing is kept
+    for each in filter(len, tracks):
         boxes = each.boxes_xyxy_px.astype(np.float64)
         boxes[:, 2:] -= boxes[:, :2]
         frame = np.full(len(each), each.frame_index)
@@ -89,10 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
     source, out = arguments.detections, arguments.out
     check_not_read(out, [source], name="--out")
     rows = read_detections(source)
-    tracker = ByteTracker(settings, fps=arguments.fps)
-    found = rows_of_tracks(
-        tracker.update(seen, frame_index=frame) for frame, seen in detections_by_frame(rows)
-    )
+    found = rows_of_tracks(tracked(ByteTracker(settings, fps=arguments.fps), rows))
     try:
         with out.open("w", encoding="utf-8") as file:
             np.savetxt(file, found, fmt="%d,%d" + 5 * ",%.4f" + 3 * ",-1")
