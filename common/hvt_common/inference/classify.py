@@ -168,6 +168,8 @@ class OnnxClassifier:
                 )
             )
         row = rows[fitting[0]]
+        if not np.isfinite(row[0]).all():
+            raise UserError(_not_a_classifier(self.model, "its scores of a picture are no numbers (NaN)"))
         if any((rows[index].argmax(axis=1) != row.argmax(axis=1)).any() for index in fitting):
             raise UserError(_not_a_classifier(self.model, "several outputs are scores, and not of the same"))
         sums_to_one = row[0].min() >= 0 and abs(row[0].sum() - 1) < 1e-2

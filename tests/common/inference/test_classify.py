@@ -140,11 +140,18 @@ def test_a_free_input_has_the_size_that_it_was_trained_at(tmp_path, imgsz, size)
 
 def test_broken_scores_say_nothing_and_odd_crops_do_not_crash(tmp_path):
     """One NaN would name an object with certainty; a sliver of a crop would end the process."""
-    model = open_model(constant_model(tmp_path / "c.onnx", np.array([[1.0, np.nan, 3.0, 0.0]])))
-    answer = OnnxClassifier(model).classify([BLUE])[0]
+    broken, whole = (
+        open_model(constant_model(tmp_path / f"{number}.onnx", np.array([[1.0, number, 3.0, 0.0]])))
+        for number in (np.nan, 2.0)
+    )
+    with pytest.raises(UserError, match=r"its scores of a picture are no numbers \(NaN\)"):
+        OnnxClassifier(broken)
+    classifier = OnnxClassifier(whole)
+    whole.runner = broken.runner  # in flight
+    answer = classifier.classify([BLUE])[0]
     np.testing.assert_allclose(answer.probabilities, [0.25] * 4)
     assert answer.entropy_nats == pytest.approx(np.log(4))
-    classifier = open_classifier(str(colour_classifier(tmp_path / "c.onnx")))
+    classifier = OnnxClassifier(open_model(colour_classifier(tmp_path / "c.onnx")))
     shapes = [(1, 1, 3), (1, 1), (3, 900, 3), (40, 40, 1), (2000, 1, 3)]
     answers = classifier.classify([np.full(shape, 7, np.uint8) for shape in shapes])
     assert [np.isfinite(answer.probabilities).all() for answer in answers] == [True] * len(shapes)
