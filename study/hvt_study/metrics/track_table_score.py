@@ -32,14 +32,18 @@ def read_tracks(path: Path) -> dict[int, FrameView]:
 
     Tables of earlier versions have ``frame``, from 1, in place of ``frame_index``.
 
-    Where the edge codes each n-th frame, those between show the list of the one before.
+    Where the edge codes each n-th frame, those between show the list of the one before. Lines of stored video that
+    came after an outage are left out, which is said: at their frames nobody knew of them.
     """
+    late = 0
     rows: dict[int, tuple[list[list[float]], list[str]]] = defaultdict(lambda: ([], []))
     try:
         with io.StringIO(read_text(path, most=MOST_TABLE_BYTES), newline="") as file:
-            for frame, box, name in _lines(csv.DictReader(file)):
-                rows[frame][0].append(box)
-                rows[frame][1].append(name)
+            for frame, box, name, is_late in _lines(csv.DictReader(file)):
+                late += is_late
+                if not is_late:
+                    rows[frame][0].append(box)
+                    rows[frame][1].append(name)
     except OSError as error:
         raise UserError(
             f"{path} cannot be read ({error.strerror}): give a table of hvt-ground --tracks"
@@ -48,11 +52,13 @@ def read_tracks(path: Path) -> dict[int, FrameView]:
         raise UserError(
             f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"
         ) from None
+    if late:
+        _log.warning("%s: %d lines came late, after an outage, and are left out", path, late)
     return _held({frame: FrameView.plain(*found) for frame, found in rows.items()})
 
 
-def _lines(table: csv.DictReader[str]) -> Iterator[tuple[int, list[float], str]]:
-    # Frame, box and class of each line; ValueError where there are none.
+def _lines(table: csv.DictReader[str]) -> Iterator[tuple[int, list[float], str, bool]]:
+    # Frame, box, class and whether it came late, of each line; ValueError where there are none.
     missing = [name for name in (*"xywh", "class") if name not in (table.fieldnames or ())]
     if missing:
         raise ValueError(f"it has no column {', '.join(missing)}")
@@ -64,7 +70,7 @@ def _lines(table: csv.DictReader[str]) -> Iterator[tuple[int, list[float], str]]
             x = y = w = h = math.nan
         if line["class"] is None or not all(abs(side) < LARGEST for side in (x, y, w, h)):  # nor for NaN
             raise ValueError(f"line {table.line_num} has no frame, box or class")
-        yield frame, [x, y, x + w, y + h], line["class"]
+        yield frame, [x, y, x + w, y + h], line["class"], line.get("late") == "1"
 
 
 def read_truth(path: Path, *, class_names: Sequence[str]) -> tuple[dict[int, FrameLabels], bool]:

@@ -1,5 +1,7 @@
 """Scores of tracks against ground truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -84,7 +86,7 @@ def overlay(frame_index, boxes, classes):
     )
 
 
-def test_the_table_of_the_ground_reads_back(tmp_path):
+def test_the_table_of_the_ground_reads_back(tmp_path, caplog):
     """What hvt-ground --tracks writes is what hvt-study score reads."""
     path = tmp_path / "tracks.csv"
     table = TrackTable(path)
@@ -92,8 +94,10 @@ def test_the_table_of_the_ground_reads_back(tmp_path):
     table.log(Notice(0, 0, "info", "not a track"))
     table.log(overlay(3, [], ()))
     table.log(overlay(4, [(0, 0, 4, 4)], ("bus",)))
+    table.log(replace(overlay(2, [(0, 0, 4, 4)], ("bus",)), stored=True))  # nobody knew it then
     table.close()
     read = read_tracks(path)
+    assert "1 lines came late, after an outage, and are left out" in caplog.text
     assert set(read) == {1, 5}
     assert read[1].class_names == ("car", "van")
     np.testing.assert_allclose(read[1].boxes_xyxy_px[0], (1, 2, 11, 22))
