@@ -240,10 +240,10 @@ _MOST_DELAY_NS = 5 * SECOND_NS
 _MEMORY_NS = 60 * SECOND_NS
 """The least delay of the last one to two of these periods counts: two clocks drift apart."""
 
-_STEP_NS = SECOND_NS
-"""Largest step of the stamps, and of the delay, from one frame to the next without a clock that was set."""
 _MOST_BEHIND_NS = 2 * SECOND_NS
 """Delay that has grown beyond this step by step means another length of a second: 25 stamps a second, 24 frames."""
+_MOST_SET_NS = SECOND_NS
+"""The same where the stamps go back: the camera's clock was set."""
 _RECENT = 32
 """Number of newest frames whose delays give the jitter."""
 _MOST_JITTER_NS = SECOND_NS // 4
@@ -266,8 +266,8 @@ class CameraClock:
         """The camera was opened again: its stamps may count from another time from now on."""
         self._least_ns: int | None = None
         self._former_ns: int | None = None
-        self._before: tuple[int, int] | None = None
-        """(camera's time, delay) of the newest frame."""
+        self._camera_ns = 0
+        """The newest frame's time by the camera."""
         self._since_ns = 0
         self._recent: deque[int] = deque(maxlen=_RECENT)
         """Delays of the newest frames."""
@@ -289,13 +289,11 @@ class CameraClock:
 
     def _ahead_ns(self, camera_ns: int, now_ns: int) -> int:
         delay_ns = now_ns - camera_ns
-        # Frames that a network held back are late, but their stamps go on.
-        steps = [abs(b - a) for a, b in zip(self._before or (), (camera_ns, delay_ns), strict=False)]
-        if steps and min(steps) > _STEP_NS:
-            self._least_ns = self._former_ns = None  # one of the two clocks was set
-        elif self._least_ns is not None and delay_ns - self._least_ns > _MOST_BEHIND_NS:
+        # Frames that a network held back are late, but their stamps go on; where they go back, a clock was set.
+        most_ns = _MOST_SET_NS if camera_ns < self._camera_ns else _MOST_BEHIND_NS
+        if self._least_ns is not None and delay_ns - self._least_ns > most_ns:
             self._least_ns = self._former_ns = None
-        self._before = camera_ns, delay_ns
+        self._camera_ns = camera_ns
         if self._least_ns is None or now_ns - self._since_ns > _MEMORY_NS:
             self._former_ns, self._least_ns, self._since_ns = self._least_ns, delay_ns, now_ns
         self._least_ns = min(self._least_ns, delay_ns)
