@@ -25,8 +25,8 @@ def run(argv: Sequence[str]) -> int:
     wanted = _wanted(arguments) if arguments.command == "find" else lambda _: True
     known = read_index(arguments.folder)
     rows = [row for row in known if wanted(row)]
-    if unread := sum(not row.session for row in known) - sum(not row.session for row in rows):
-        said = f"files that the ground has not read yet, and that may be of them: {unread}"
+    if unread := sum(not (row.whole or wanted(row)) and arguments.edge in (None, row.edge) for row in known):
+        said = f"files that are being written or are not read yet, and that may be of them: {unread}"
         print(f"hvt-ground recordings: {said}", file=sys.stderr)
     if arguments.json:
         print(json.dumps([_as_json(row, arguments.folder) for row in rows], indent=2))
@@ -93,7 +93,7 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
 
 
 def _as_json(row: RecordingRow, folder: Path) -> dict[str, object]:
-    unknown = {} if row.session else dict.fromkeys(("session", "frames", "stills", "video"))
+    unknown = {} if row.session else dict.fromkeys(("session", "frames", "stills", "classes", "video"))
     return (
         asdict(row)
         | unknown
