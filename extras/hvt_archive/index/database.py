@@ -77,11 +77,11 @@ class Index:
                 "INSERT INTO classes VALUES (?, ?, ?)", [(row.file, *one) for one in row.classes.items()]
             )
 
-    def stripped(self, file: str, *, size_bytes: int) -> None:
+    def change(self, file: str, **facts: int) -> None:
+        """Set some facts of a file by their names; the others stay, and its classes."""
+        named = ", ".join(f"{name} = ?" for name in facts)
         with self._database as transaction:
-            transaction.execute(
-                "UPDATE recordings SET video = 0, size_bytes = ? WHERE file = ?", [size_bytes, file]
-            )
+            transaction.execute(f"UPDATE recordings SET {named} WHERE file = ?", [*facts.values(), file])  # noqa: S608
 
     def forget(self, files: Iterable[str]) -> None:
         with self._database as transaction:

@@ -92,6 +92,7 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
             self._remove_due(now)
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
+        self.unread.clear()
         self._index.close()
 
     def _pass_time(self) -> Moment:
@@ -122,9 +123,13 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
                     continue
                 if row is None and begins_as_of(edge, path):
                     # Nobody saw how old one is that is met for the first time.
-                    row = RecordingRow(name, edge, _UNREAD, None, None, now_ns, size_bytes, 0, 0)
-            if row is not None:
-                self._index.put(replace(row, size_bytes=size_bytes))
+                    backlog = "-backlog" in name
+                    row = RecordingRow(
+                        name, edge, _UNREAD, None, None, now_ns, size_bytes, 0, 0, backlog=backlog
+                    )
+                    self._index.put(row)
+                elif row is not None:
+                    self._index.change(name, size_bytes=size_bytes)
             self.unread.append(name)
 
     def _read(self, name: str, now_ns: int) -> None:
@@ -138,7 +143,7 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
             elif row is not None and row.session == _UNREAD:
                 self._index.forget([name])
             elif row is not None:
-                self._index.put(replace(row, size_bytes=path.stat().st_size, whole=True))
+                self._index.change(name, size_bytes=path.stat().st_size, whole=True)
 
     def _remove_due(self, now: Moment) -> None:
         self._looked_ns, retention = now.steady_ns, self._retention
@@ -178,7 +183,7 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         path = self._folder / row.file
         if not self._done(row.file, "stripped of its video", partial(remove_video, path)):
             return False
-        self._index.stripped(row.file, size_bytes=path.stat().st_size)
+        self._index.change(row.file, size_bytes=path.stat().st_size, video=False)
         _log.warning("the video of recording %s is removed: it is older than --keep-video", row.file)
         return True
 
@@ -215,11 +220,12 @@ class RecordingsFolder(Service):
             failures=self._failures,
             unhurried=True,
         )
-        self._clock.start()
 
     def _opened(self) -> IndexWriter:
         lower_priority()  # with the programs that read files and remove video: live video goes before them
         self._writer = IndexWriter(self._folder, self._retention)
+        if self._clock.ident is None:
+            self._clock.start()
         return self._writer
 
     def recorded(self, row: RecordingRow) -> None:
@@ -230,17 +236,18 @@ class RecordingsFolder(Service):
         """Write the queue, within a few seconds."""
         self._stop.set()
         if self._sink is not None:
-            self._clock.join()
+            if self._clock.ident is not None:
+                self._clock.join()
             self._sink.join(time.monotonic() + _END_S)
 
     def _poll(self) -> None:
         # Files grow old while nobody flies, too.
-        while self._sink is not None and not self._stop.wait(self._pause_s()):
-            if self._sink.idle and self._sink.is_open():
+        while not self._stop.wait(self._pause_s()):
+            if self._sink is not None and self._sink.idle and self._sink.is_open():
                 self._sink.log(None)
 
     def _pause_s(self) -> float:
-        return _BEHIND_S if self._writer is None or self._writer.unread else _POLL_S
+        return _BEHIND_S if self._writer is not None and self._writer.unread else _POLL_S
 
 
 def _is_plain(name: str) -> bool:

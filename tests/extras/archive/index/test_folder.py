@@ -151,6 +151,10 @@ def test_files_tell_the_same_when_the_index_is_lost(copied):
         odd.log("/base/tracks", boxes, rr.AnyValues(track_id=pa.array([[1, 2]])))
     after = look(copied)
     assert [replace(one, written_ns=0) for one in after] == [replace(one, written_ns=0) for one in before]
+    (copied / INDEX).unlink()
+    late = (copied / NAMES[0]).rename(copied / f"{STEM}-0001-backlog.rrd")
+    IndexWriter(copied, ALL).close()
+    assert [one.file for one in read_index(copied) if one.backlog] == [late.name], "its name says it"
 
 
 @pytest.mark.parametrize("damage", ["text", "zeros", "half", "empty"])
@@ -292,6 +296,41 @@ def test_files_that_were_not_read_yet_count_and_keep_no_flight_waiting(copied, m
         assert writer.unread == [*(one.name for one in strangers), *NAMES]
     assert not (copied / NAMES[0]).exists()
     assert all(one.exists() for one in strangers)
+
+
+def test_what_was_known_of_a_file_stays_until_it_is_read(copied):
+    """After a power cut `find --class truck` left it out, and for good where it cannot be read any more."""
+    before = read_index(copied)
+    with closing(sqlite3.connect(copied / INDEX)) as killed, killed:
+        killed.execute("UPDATE recordings SET whole = 0")
+    (copied / NAMES[0]).write_bytes(b"RRF2 no more")
+    IndexWriter(copied, ALL).close()
+    left = [replace(one, whole=False) for one in before]
+    assert read_index(copied) == [replace(left[0], size_bytes=12), left[1]]
+    assert [(one.classes, one.whole) for one in look(copied)] == [(one.classes, True) for one in before]
+
+
+@pytest.mark.parametrize("how", ["never opened", "fails later"])
+def test_an_index_that_fails_is_not_asked_to_read_on(copied, monkeypatch, how):
+    """A ground woke 20 times a second for as long as its disk was away."""
+    failures = Failures(time.time_ns)
+
+    def fail(path: Path | None = None) -> None:
+        for one in copied.glob(f"{INDEX}*"):
+            one.unlink()
+        (copied / INDEX).mkdir()
+        if path is not None:
+            raise sqlite3.OperationalError("the disk is away")
+
+    monkeypatch.setattr(folder, "described", fail)
+    if how == "never opened":
+        fail()
+    else:
+        (copied / INDEX).unlink()
+    with RecordingsFolder(copied, ALL, failures=failures) as index:
+        index.begin()
+        eventually(lambda: failures.parts, what="it is said")
+        assert index._pause_s() >= 60  # noqa: SLF001 - how often it would wake
 
 
 def test_by_age_and_by_bytes(copied, caplog):
