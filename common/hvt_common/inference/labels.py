@@ -42,6 +42,7 @@ _MARKED = re.compile(r"""(?=[-'"])(?:- +)?(['"]?)(\S.*?)\1""")
 _SYNSET = re.compile(r"n\d{8}\s+")
 _PLAIN_LIST = re.compile(r"\[([^][{}'\":]*[^\W\d][^][{}'\":]*)\]")
 """YAML's, without quotes."""
+_PAIR = re.compile(r"""\s*(\d+)\s*[:=]\s*(['"]?)([^][{}'":=\s][^:=]*?)\2\s*""")
 _OF_TABLE = re.compile(r"[\[\]{}]|:$|^names\s*:")
 
 
@@ -187,10 +188,10 @@ def _written_names(text: str) -> tuple[str, ...] | None:
 
 def _unquoted(text: str) -> dict[str, str]:
     # A table as YAML and others write it: ``{0: car, 1: bus}``. `ValueError` for anything else.
-    pairs = [re.fullmatch(r"\s*(\d+)\s*[:=]\s*([^][{}'\":=]+?)\s*", one) for one in text[1:-1].split(",")]
+    pairs = [_PAIR.fullmatch(one) for one in text[1:-1].split(",")]
     if text[-1] != "}" or not all(pairs):
         raise ValueError(text)
-    return {pair[1]: pair[2] for pair in pairs if pair}
+    return {pair[1]: pair[3] for pair in pairs if pair}
 
 
 def table_names(value: object) -> tuple[str, ...] | None:
@@ -198,16 +199,17 @@ def table_names(value: object) -> tuple[str, ...] | None:
 
     A name is one line that a terminal can hold; one that is empty or missing is "class" and its number.
     """
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    if any(isinstance(item, dict | list | tuple | set) for item in items):
+        return None
     if isinstance(value, dict):
-        if set(value.values()) == set(range(len(value))):  # by name, as Keras has them
+        if set(items) == set(range(len(value))):  # by name, as Keras has them
             value = {number: name for name, number in value.items()}
         numbers = {int(key): name for key, name in value.items() if re.fullmatch(r"\d{1,6}", str(key))}
         if len(numbers) < len(value) or max(numbers, default=MAX_LABELS) >= MAX_LABELS:
             return None
         value = numbered_names(numbers)
     if not isinstance(value, list | tuple) or not 0 < len(value) <= MAX_LABELS:
-        return None
-    if any(isinstance(item, dict | list | tuple) for item in value):
         return None
     known = ("" if item is None else str(item)[:MAX_LABEL_CHARS] for item in value)
     plain = (shown_text(item).replace("\n", "?").strip() for item in known)

@@ -282,18 +282,22 @@ def test_a_picture_that_is_not_there_is_called_so(tmp_path):
         ("names: &all\n- 'it''s'\n- bus #2\n", ("it's", "bus")),
         ('names: {0: , 1: "bus\\e[31m"}\n', ("class 0", "bus?[31m")),
         *(
-            (bad, None)
+            (bad, r"is no YAML \(")
             for bad in ("names: [car", "names: *nobody\n", "a: 1\n---\nnames: [car]\n", "[" * 5000)
+        ),
+        *(
+            (f"names: {{0: {bad}, 1: bus}}\n", "has no class names; accepted is names: with")
+            for bad in ("[car]", "{a: b}", "!!set {car}")
         ),
     ],
 )
 def test_names_of_a_yaml_are_those_of_a_yaml_reader(tmp_path, yaml, names):
     """Names were taken in the order of the file, and cut at commas within quotes; half a file would give half."""
     path = text(tmp_path / "data.yaml", yaml)
-    if names:
+    if isinstance(names, tuple):
         assert read_class_file(path) == names
     else:
-        with pytest.raises(UserError, match=r"data\.yaml is no YAML \("):
+        with pytest.raises(UserError, match=rf"data\.yaml {names}"):
             read_class_file(path)
 
 
