@@ -199,16 +199,17 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
     try:
         about = json.loads(label_text(path))
         categories = [(_id(row["id"]), label_files.class_word(row["name"])) for row in about["categories"]]
-        names = dict(categories)
-        unclear_names = {key for key, name in categories if names[key] != name}
+        names = {key: name for key, name in categories if key is not None}
+        unclear_names = {key for key, name in categories if names.get(key) != name}
         rows = about["annotations"] if "annotations" in about else about["annotation"]
         images = [
             (
-                _id(image["id"]),
+                key,
                 str(image["file_name"] if "file_name" in image else image["filename"]),
                 _said_size(image),
             )
             for image in about["images"]
+            if (key := _id(image["id"])) is not None
         ]
         of: dict[Any, list[dict[str, Any]]] = {key: [] for key, _, _ in images}
         for number, row in enumerate(rows, start=1):

@@ -446,7 +446,10 @@ def test_what_coco_says_of_classes_and_crowds_counts(tmp_path):
         rows = about["annotations"]
         rows[1]["ignore"] = 1
         about["categories"] += [{"id": 7, "name": None}, {"id": 8, "name": "car"}, {"id": 8, "name": "van"}]
-        rows += [{**rows[0], "id": kind, "category_id": kind} for kind in (7, 8, [9])]
+        about["categories"].append({"id": [6], "name": "bus"})
+        about["images"].append({"id": [1], "file_name": "a.jpg"})
+        broken = [*({"category_id": kind} for kind in (7, 8, [9], None)), {"image_id": None}]
+        rows += [{**rows[0], **one, "bbox": [9, 9, 20 + place, 9]} for place, one in enumerate(broken)]
 
     lay(tmp_path, "a.jpg", **{"labels.json": coco(box=[100, 10, 20, 20], change=change)})
     ((one, labels),) = read(tmp_path)
@@ -454,7 +457,7 @@ def test_what_coco_says_of_classes_and_crowds_counts(tmp_path):
     assert labels.beside_xyxy_px.tolist() == [[100, 10, 120, 30]]
     assert not len(labels.ignored_xyxy_px), "pycocotools counts what stands before a crowd"
     assert labels.passed_xyxy_px.tolist() == [[100, 10, 120, 30]], "it would be taught as background"
-    assert "3 labels were left out" in doubts_of([one])[0]
+    assert "5 labels were left out" in doubts_of([one])[0]
 
 
 def test_a_sensors_levels_are_shown_as_the_edge_shows_them(tmp_path):
