@@ -145,16 +145,14 @@ class OnnxClassifier:
         # (output, classes, whether logits): probabilities add up to 1, or lie in 0…1; of several, as many as names.
         batch, (width, height) = self._batch or 1, self._size
         shape = (batch, 3, height, width) if self._channels_first else (batch, height, width, 3)
-        noise, dtype = np.random.default_rng(0).normal(0, 1, shape), self.model.inputs[0].dtype
+        noise = np.random.default_rng(0).normal(0, 1, shape)
         pictures = [noise, noise * _OPPOSITE]
-        if dtype == np.uint8:
+        if self.model.inputs[0].dtype == np.uint8:
             pictures = [np.clip(128 + 64 * one, 0, 255) for one in (noise, -noise)]
-        runs = [self.model.run(one.astype(dtype)) for one in pictures]
-        rows = {
-            index: np.stack([run[index].reshape(batch, -1)[0].astype(np.float64) for run in runs])
-            for index, output in enumerate(runs[0])
-            if _is_scores(output, batch)
-        }
+        rows = self._rows(pictures, batch)
+        if not all(np.isfinite(row[0]).all() for row in rows.values()):
+            # It may take a root of its pixels, and no picture has one below 0.
+            rows = self._rows([np.full(shape, 0.5), np.abs(pictures[1])], batch)
         if not rows:
             raise UserError(_not_a_classifier(self.model, "no output is one row of scores an image"))
         sizes = {row.shape[1] for row in rows.values()}
@@ -180,6 +178,17 @@ class OnnxClassifier:
                 self.model.path.name,
             )
         return fitting[0], row.shape[1], not (sums_to_one or each)
+
+    def _rows(
+        self, pictures: Sequence[npt.NDArray[Any]], batch: int
+    ) -> dict[int, npt.NDArray[np.float64]]:
+        # By output that may be scores: a row of each picture.
+        runs = [self.model.run(one.astype(self.model.inputs[0].dtype)) for one in pictures]
+        return {
+            index: np.stack([run[index].reshape(batch, -1)[0].astype(np.float64) for run in runs])
+            for index, output in enumerate(runs[0])
+            if _is_scores(output, batch)
+        }
 
 
 def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:

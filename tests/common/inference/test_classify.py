@@ -111,14 +111,17 @@ def test_more_crops_than_one_batch_keep_their_order(tmp_path):
     assert confidences[69] > confidences[0] + 0.4
 
 
-def test_logits_and_probabilities_give_the_same_posterior(tmp_path, caplog):
-    """Certainty would depend on how a model was exported; a sigmoid a class is no logit."""
+@pytest.mark.parametrize("rooted", [False, True])
+def test_logits_and_probabilities_give_the_same_posterior(tmp_path, caplog, *, rooted):
+    """Certainty would depend on how a model was exported; a sigmoid a class is no logit, a root no fault."""
     crop = np.full((5, 5, 3), (10, 20, 40), np.uint8)
     expected = np.exp([2.0, 1.0, 0.5]) / np.exp([2.0, 1.0, 0.5]).sum()
     each = 1 / (1 + np.exp([-2.0, -1.0, -0.5]))
     answers: Any = [({}, expected), ({"softmax": True}, expected), ({"sigmoid": True}, each / each.sum())]
     for how, wanted in answers:
         path = colour_classifier(tmp_path / "c.onnx", metadata=PLAIN, gain=0.05, **how)
+        if rooted:
+            scaling_inside(path, [("Sqrt", None), ("Pow", [2])])
         (answer,) = open_classifier(str(path)).classify([crop])
         np.testing.assert_allclose(answer.probabilities, wanted, rtol=1e-4)
         assert (answer.class_name, answer.confidence) == ("class 0", pytest.approx(wanted[0], rel=1e-4))
