@@ -179,9 +179,7 @@ class OnnxClassifier:
             )
         return fitting[0], row.shape[1], not (sums_to_one or each)
 
-    def _rows(
-        self, pictures: Sequence[npt.NDArray[Any]], batch: int
-    ) -> dict[int, npt.NDArray[np.float64]]:
+    def _rows(self, pictures: Sequence[npt.NDArray[Any]], batch: int) -> dict[int, npt.NDArray[np.float64]]:
         # By output that may be scores: a row of each picture.
         runs = [self.model.run(one.astype(self.model.inputs[0].dtype)) for one in pictures]
         return {

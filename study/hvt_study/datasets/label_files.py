@@ -54,10 +54,11 @@ _OTHER = {
 }
 _OTHER_FILES = (".json", ".jsonl", ".ndjson", ".csv", ".odgt", ".xml")
 _OTHER_WORDS = re.compile(
-    rb"bbox|bounding_?box|x_?min|box2d|gtboxes|shape_attributes|rectanglelabels|<box |\"(?:shapes|annotations)\"",
+    rb"bbox|\"bounding_?box\w*\"\s*:|(?<![a-z])x_?min|box2d|gtboxes|shape_attributes|rectanglelabels|<box |"
+    rb"\"(?:shapes|annotations)\"",
     re.IGNORECASE,
 )
-"""In the first bytes of files that hold labels of a kind that is not read."""
+"""In the first bytes of files that hold labels of a kind that is not read; XML has bounding boxes of places."""
 _LOOKED_AT = 65536
 _CLASSES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml")
 _COCO = ("labels.json", "result.json", "annotations.json", "_annotations.coco.json", "coco.json")
@@ -137,9 +138,18 @@ def label_file(picture: Path, place: Path, folders: Folders) -> Path | None:
 
 def check_strange(place: Path, pictures: Sequence[Path]) -> None:
     """Raise `UserError` for labels of a kind that is not read, which nobody means to be left out."""
-    strange = [(place / name, f"labels of {kind}") for name, kind in _OTHER.items()]
+    place = place.resolve()
+    homes = dict.fromkeys(one.parent.resolve() for one in pictures)
+    folders = dict.fromkeys((place, *homes))
+    strange = [
+        (folder / name, f"labels of {kind}")
+        for folder in dict.fromkeys((*folders, *(home.parent for home in homes)))
+        for name, kind in _OTHER.items()
+        if "." in name
+        or folder.is_relative_to(place)  # a folder beside the one that is given may have any name
+    ]
     strange += [(file.with_suffix(".json"), "labels of LabelMe") for file in pictures[:_DEPTH]]
-    for folder in dict.fromkeys((place, *(one.parent for one in pictures))):
+    for folder in folders:
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() in _OTHER_FILES and file.is_file():
                 with suppress(OSError), file.open("rb") as opened:

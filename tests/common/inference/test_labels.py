@@ -97,7 +97,10 @@ def test_a_file_that_holds_no_labels_is_refused(tmp_path, content, words):
         ({"classes": "[" * 100_000}, None),
         ({"classes": "3"}, None),
         ({"names": "{0: small car, 1: bus}"}, ("small car", "bus")),
-        ({"names": "{0: driver's seat, 1: car [small], 2: 'a bus'}"}, ("driver's seat", "car [small]", "a bus")),
+        (
+            {"names": "{0: driver's seat, 1: car [small], 2: 'a bus'}"},
+            ("driver's seat", "car [small]", "a bus"),
+        ),
         ({"names": "{0: [car, 1: bus}"}, None),
         ({"names": "{0: 'car, 1: bus}"}, None),
         ({"classes": '{"bus": 1, "car": 0}'}, ("car", "bus")),

@@ -335,6 +335,8 @@ REFUSED = [
     ({"val.odgt": '{"ID": "a", "gtboxes": []}'}, UNREAD),
     ({"gt.txt": "1,1,20,10,40,40,car"}, UNREAD),
     ({"groundtruth.txt": "20,10,40,40"}, UNREAD),
+    ({"images/GOT-1/1.jpg": "", "images/GOT-1/groundtruth.txt": "20,10,40,40"}, UNREAD),
+    ({"images/cat/cat-1/img/1.jpg": "", "images/cat/cat-1/groundtruth.txt": "20,10,40,40"}, UNREAD),
     ({"boxes.csv": "ImageID,LabelName,XMin,XMax,YMin,YMax"}, UNREAD),
     ({"boxes.csv": ("filename;xmin;ymin;xmax;ymax;class", "utf-16")}, UNREAD),
     ({"train.jsonl": '{"image": "a.jpg", "bbox": [1, 2, 3, 4]}'}, UNREAD),
@@ -378,16 +380,19 @@ def judged(root, *, late):
 
 def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
     """Pictures of a flight could not be looked at beside the flight's own log."""
+    place = tmp_path / "day"
     lay(
-        tmp_path,
+        place,
         "0.png",
         **{"flight.csv": "time,latitude,coordinates,alt\n1,2,3,4\n", "t.csv": "time,x\n1,2"},
-    )
-    lay(
-        tmp_path,
         **{"route.json": '{"type": "Point", "coordinates": [8, 47]}', "meta.json": '{"labels": ["day"]}'},
+        **{"weather.csv": "maxMinTemp,vox_min\n1,2", "0.png.aux.xml": "<GeographicBoundingBox/>"},
+        **{"../ann/0.json": "{}"},
     )
-    assert [one.labels for one in find_pictures(tmp_path, classes=None)] == [None]
+    assert [one.labels for one in find_pictures(place, classes=None)] == [None]
+    text(tmp_path / "groundtruth.txt", "20,10,40,40")
+    with pytest.raises(UserError, match=UNREAD):
+        find_pictures(place, classes=None)
 
 
 XML_OBJECT = voc()[voc().index("<object>") :]
