@@ -152,6 +152,8 @@ class BacklogStage:
         self._back_ns = clock()
         self._segment_ns: int | None = None
         self._probed_ns = self._trickle_ns = 0
+        self._unseen = False
+        """Whether the newest report says that its ground has had no picture."""
         self.frames = 0
         """Frames stored to be sent later; they include those also sent as probes of whether the link is back."""
         self.max_bytes = store.max_bytes
@@ -208,9 +210,18 @@ class BacklogStage:
             self._segment_ns = None  # later frames can be shown only from the next keyframe on
         return taken
 
-    def probe_due(self, now_ns: int) -> bool:
-        """Whether the next frame should be sent too: without any, no ground can show that the link is back."""
-        return self.offline and self._linked and now_ns - self._probed_ns >= _PROBE_NS
+    def probe_due(self, now_ns: int, *, keyframe: bool) -> bool:
+        """Whether the next frame should be sent too: without any, no ground can show that the link is back.
+
+        A ground that has seen nothing can show it by a ``keyframe`` alone.
+        """
+        due = now_ns - self._probed_ns >= _PROBE_NS or (keyframe and self._unseen)
+        return self.offline and self._linked and due
+
+    @property
+    def shows_nothing(self) -> bool:
+        """Whether a ground that has seen no picture yet waits for the link."""
+        return self.offline and self._unseen
 
     def resume(self) -> None:
         """Send the keyframe that was made for the restart, and all later frames."""
@@ -289,6 +300,7 @@ class BacklogStage:
         named = feedback.base_sequence
         # After the last frame no later one can show that an earlier one was lost.
         sent = named if self._finishing and not feedback.misses_video else self._line.base_sequence
+        self._unseen = feedback.misses_video
         self._outage.reported(now_ns, named=named, sent=sent, misses_video=feedback.misses_video)
         if feedback.backlog:
             self.worker.intake.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)

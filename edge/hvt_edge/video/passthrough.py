@@ -250,7 +250,7 @@ class PassthroughStage(BaseStage):
                 admitted=wanted and self._admitted(unit, now_ns, live=link is State.LIVE),
                 link=link,
                 segment_due=keyframe,
-                probe_due=backlog is not None and backlog.probe_due(now_ns),
+                probe_due=backlog is not None and backlog.probe_due(now_ns, keyframe=keyframe),
             )
         )
         if not decision.codes:

@@ -79,12 +79,16 @@ class Unseen:
 
     def note(self, status: Status, now_ns: int) -> bool:
         """Take a further report of the edge; whether its keyframes have not come for long."""
+        if status.base_messages < self.first.base_messages:  # one of the two was forged
+            self.first, self.since_ns = status, now_ns
         sent, first = status.base_messages - self.first.base_messages, self.first.health.keyframes
-        if self.came and status.health.keyframes == first:
-            sent = 0  # who joins between two keyframes waits for the next one
+        if True in self.came or (self.came and status.health.keyframes == first):
+            sent = (
+                0  # who joins between two keyframes waits for the next one; pictures that come are not lost
+            )
         lasts_ns = now_ns - self.since_ns
         self.lost = sent if lasts_ns >= _OVERDUE_NS else 0
-        return lasts_ns >= _UNSEEN_NS and sent >= _UNSEEN and True not in self.came
+        return lasts_ns >= _UNSEEN_NS and sent >= _UNSEEN
 
     def feedback(self, **of_receiver: Any) -> Feedback:
         """The report of a ground that waits: nothing of the session can be shown."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from hvt_common.protocol.messages import Flags
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController
@@ -86,14 +87,18 @@ def test_a_ground_that_hears_and_misses_video_is_said_and_stored_for(rig):
     )
     rig.out.dark = True
     rig.play(0, 15)
-    for first in range(15, 195, 15):
+    for first in range(15, 195, 5):
         said = replace(waits, sequence=first, send_ns=rig.now_ns)
         rig.link_control.on_feedback(said)
-        rig.play(first, first + 15)
+        if first == 120:
+            rig.keyframes.request(rig.now_ns)
+        rig.play(first, first + 5)
     assert rig.backlog.frames >= 120
     (failed,) = rig.failures.now
     assert failed.part == "pictures"
     assert "large packets are lost" in failed.reason
+    asked = next(one for one in rig.out.base if one.frame_index >= 120)
+    assert asked.flags & Flags.KEYFRAME, "it alone can show a ground without a picture that the way is free"
     rig.out.dark = False
     rig.play(195, 210, reports=True)
     assert not rig.failures.now

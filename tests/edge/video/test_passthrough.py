@@ -122,7 +122,8 @@ class Store:
 
     state, segment_open, probes = LIVE, True, False
 
-    def probe_due(self, _now_ns: int) -> bool:
+    def probe_due(self, _now_ns: int, *, keyframe: bool) -> bool:
+        del keyframe
         return self.probes
 
     def resume(self) -> None:
