@@ -156,10 +156,18 @@ def check_strange(place: Path, pictures: Sequence[Path]) -> None:
                     if _OTHER_WORDS.search(opened.read(_LOOKED_AT).replace(b"\0", b"")):
                         strange.append((file, "labels, it seems"))
     for path, what in strange:
-        if path.exists():
+        if path.exists() and not _holds_camera_poses(path):
             raise UserError(
                 f"{path} holds {what}, which are not read: export them as COCO, YOLO or Pascal VOC"
             )
+
+
+def _holds_camera_poses(path: Path) -> bool:
+    # Of TUM RGB-D, beside its folders of pictures: 1305031098.66 1.35 0.63 1.63 0.65 0.61 -0.29 -0.32
+    if path.name != "groundtruth.txt" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b"," not in file.read(_LOOKED_AT)
 
 
 def class_file(place: Path, pictures: list[Path]) -> Path | None:

@@ -387,7 +387,7 @@ def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
         **{"flight.csv": "time,latitude,coordinates,alt\n1,2,3,4\n", "t.csv": "time,x\n1,2"},
         **{"route.json": '{"type": "Point", "coordinates": [8, 47]}', "meta.json": '{"labels": ["day"]}'},
         **{"weather.csv": "maxMinTemp,vox_min\n1,2", "0.png.aux.xml": "<GeographicBoundingBox/>"},
-        **{"../ann/0.json": "{}"},
+        **{"../ann/0.json": "{}", "groundtruth.txt": "# timestamp tx ty\n1305031098.66 1.35 0.63 1.63\n"},
     )
     assert [one.labels for one in find_pictures(place, classes=None)] == [None]
     text(tmp_path / "groundtruth.txt", "20,10,40,40")
