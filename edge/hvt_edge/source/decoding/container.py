@@ -56,7 +56,7 @@ _FILE_OPTIONS = {
     # An HLS playlist whose recorder has ended is read from its beginning, and polled thrice for more.
     "live_start_index": "0",
     "m3u8_hold_counters": "3",
-    # Else FFmpeg asks on a line that the server has closed, and leaves out the frame that it wanted there.
+    # Else FFmpeg asks on a line that most servers have closed, and leaves out the frame that it wanted there.
     "multiple_requests": "1",
 }
 _PLAYLIST, _IN_SEGMENTS = ".m3u8", "hls"
@@ -118,7 +118,15 @@ def open_video(
             options = {**options, "m3u8_hold_counters": "1000"}
         elif local and growing:
             file = _GrowingFile(spec)
-        container = av.open(file, options=options, timeout=(_OPEN_S, _READ_S))
+        try:
+            container = av.open(file, options=options, timeout=(_OPEN_S, _READ_S))
+        except av.error.FFmpegError:
+            if local:
+                raise
+            # A server of one line at a time does not answer on a second one while the first is open.
+            container = av.open(
+                file, options={**options, "multiple_requests": "0"}, timeout=(_OPEN_S, _READ_S)
+            )
     except (av.error.FFmpegError, OSError, ValueError) as error:
         unfinished = _lacks_index(Path(spec)) if local else ""
         raise refusal(
