@@ -49,6 +49,8 @@ QUIET_S, _POLL_S = 10.0, 0.1
 """A file that has not grown for this long has ended."""
 _MOST_BOXES = 2**16
 """Nine hours of fragments, a second each."""
+_MOST_ZEROS = 2**24
+"""Bytes behind the last box that are looked at."""
 DEMUX_OPTIONS = {"merge_pmt_versions": "1"}
 """A sender of MPEG-TS that begins anew may number its film otherwise: it is the same film to a viewer."""
 _FILE_OPTIONS = {
@@ -288,9 +290,9 @@ def decoded(
             _log.warning("%s: %s", name, timeline.says)
     if len(timeline.jumps) > 1:
         _log.warning("%s: its time stamps jumped %d times in all", name, len(timeline.jumps))
-    if timeline.jumps and before_s is not None:  # a header counts the steps ahead that were mended
-        ahead_s = sum((step_s for _, step_s in timeline.jumps if step_s > 0), Fraction(0))
-        reading.end_s = before_s + stamps.period_s + ahead_s
+    if timeline.jumps and before_s is not None:
+        reading.ahead_s = sum((step_s for _, step_s in timeline.jumps if step_s > 0), Fraction(0))
+        reading.end_s = before_s + stamps.period_s
     for sentence in reading.faults():
         _log.warning("%s %s", name, sentence)
 
@@ -304,6 +306,8 @@ class _Reading:
         self._ended = ""
         self.end_s: Fraction | None = None
         """End of the film by its time stamps, as far as these go on."""
+        self.ahead_s = Fraction(0)
+        """Steps ahead within it that were mended."""
         self._end_byte = 0
 
     def frames(self) -> Iterator[av.VideoFrame]:
@@ -359,6 +363,7 @@ class _Reading:
         whole = stream.duration or len(container.streams) == 1 or container.format.name == _IN_SEGMENTS
         said_s = duration_s(stream) if whole else None
         if said_s is not None and self.end_s is not None:
+            said_s -= self.ahead_s  # a header counts them
             missing_s = said_s - (self.end_s - self._begin_s)
             if missing_s > max(Fraction(1), said_s / 50) and not self._is_rounded():
                 return f"it is {float(missing_s):.1f} s shorter than its header says"
@@ -468,6 +473,8 @@ def _boxes_of(path: Path) -> list[tuple[bytes, int]]:
         while at + 8 <= end and len(boxes) < _MOST_BOXES:
             file.seek(at)
             head = file.read(24)
+            if not any(head) and not file.read(_MOST_ZEROS).strip(b"\0"):
+                break  # space that a recorder reserved
             boxes.append((head[4:8], int.from_bytes(head[20:], "big")))
             size = int.from_bytes(head[:4], "big")
             size = int.from_bytes(head[8:16], "big") if size == 1 else size

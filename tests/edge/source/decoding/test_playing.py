@@ -424,19 +424,26 @@ def test_an_mp4_without_its_index_says_what_it_is(tmp_path):
         play(clip)
 
 
+FRAGMENTED = {"muxer": {"movflags": "frag_keyframe+empty_moov"}}
+
+
 @pytest.mark.parametrize(
-    ("name", "options"),
+    ("name", "made", "zeros"),
     [
-        *(("a.mp4", {"movflags": flags}) for flags in ("faststart", "frag_keyframe+empty_moov")),
-        *((name, {}) for name in ("a.mkv", "a.ts")),
+        ("a.mp4", {"muxer": {"movflags": "faststart"}}, 0),
+        *(("a.mp4", FRAGMENTED, zeros) for zeros in (0, 8, 10, 4096)),
+        *((name, {}, 0) for name in ("a.mkv", "a.ts")),
+        # Two seconds are a third of it, but nothing beside ten hours.
+        ("a.mkv", {"times_ms": [33 * one + 37_600_000 * (one >= 30) for one in range(150)]}, 0),
     ],
 )
-def test_a_cut_clip_says_that_it_is_unfinished(tmp_path, caplog, name, options):
-    """Half of a clip would pass for a whole one."""
-    clip = write_numbered(tmp_path / name, 150, muxer=options, g="10", bf="0")
+def test_a_cut_clip_says_that_it_is_unfinished(tmp_path, caplog, name, made, zeros):
+    """Half of a clip would pass for a whole one, or a whole one, with reserved space behind it, for half of one."""
+    clip = write_numbered(tmp_path / name, 150, **made, g="10", bf="0")
+    data = clip.read_bytes()
+    clip.write_bytes(data + bytes(zeros))
     play(clip)
     assert "unfinished" not in caplog.text
-    data = clip.read_bytes()
     clip.write_bytes(data[: len(data) * 6 // 10 | 1])
     assert 30 < len(play(clip)[1]) < 150
     assert f"{name} is unfinished: " in caplog.text
