@@ -129,10 +129,6 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         return super().parse_known_args(_with_joined_values(args), namespace)
 
-    def _get_value(self, action: argparse.Action, text: str) -> Any:
-        # argparse reads a default that is text as if it had been given.
-        return text if text == action.default == "" else super()._get_value(action, text)
-
     def add_subparsers(self, **settings: Any) -> Any:
         commands = super().add_subparsers(**settings)
         commands.type = str  # it takes all words that follow: the command's own option is to be named

@@ -215,13 +215,13 @@ class BacklogStage:
 
         A ground that has seen nothing can show it by a ``keyframe`` alone.
         """
-        due = now_ns - self._probed_ns >= _PROBE_NS or (keyframe and self._unseen)
-        return self.offline and self._linked and due
+        due = now_ns - self._probed_ns >= _PROBE_NS
+        return self.offline and self._linked and (due or (keyframe and self._unseen))
 
     @property
-    def shows_nothing(self) -> bool:
-        """Whether a ground that has seen no picture yet waits for the link."""
-        return self.offline and self._unseen
+    def awaits_keyframe(self) -> bool:
+        """Whether a ground that has seen no picture needs one: in the store it would be none for it."""
+        return self.offline and self._linked and self._unseen
 
     def resume(self) -> None:
         """Send the keyframe that was made for the restart, and all later frames."""

@@ -196,10 +196,10 @@ class BaseStage:
         due = self._frame_skip.codes(frame.index)
         admitted = not yields_to_keyframe and self.admits(now_ns, line_bytes, self._coding_ns)
         coded = due and admitted and not keyframe_due and link is State.LIVE
+        if backlog is not None and backlog.awaits_keyframe and not admitted:
+            keyframe_due = False  # it waits for room
         segment_due = backlog is not None and backlog.segment_due(now_ns)
-        if backlog is not None and backlog.shows_nothing and not admitted:
-            keyframe_due = False  # it would go to the store alone, and the ground that waits for it have none
-        probe_key = keyframe_due or segment_due
+        probe_due = backlog is not None and backlog.probe_due(now_ns, keyframe=keyframe_due or segment_due)
         decision = decide(
             FrameInputs(
                 due=due,
@@ -208,7 +208,7 @@ class BaseStage:
                 yielded=coded and budget.leaves_out(now_ns),
                 link=link,
                 segment_due=segment_due,
-                probe_due=backlog is not None and backlog.probe_due(now_ns, keyframe=probe_key),
+                probe_due=probe_due,
             )
         )
         if decision.action is Action.HOLD and not admitted:

@@ -82,10 +82,9 @@ class Unseen:
         if status.base_messages < self.first.base_messages:  # one of the two was forged
             self.first, self.since_ns = status, now_ns
         sent, first = status.base_messages - self.first.base_messages, self.first.health.keyframes
+        # Keyframes that come are not lost; who joins between two of them waits for the next one.
         if True in self.came or (self.came and status.health.keyframes == first):
-            sent = (
-                0  # who joins between two keyframes waits for the next one; pictures that come are not lost
-            )
+            sent = 0
         lasts_ns = now_ns - self.since_ns
         self.lost = sent if lasts_ns >= _OVERDUE_NS else 0
         return lasts_ns >= _UNSEEN_NS and sent >= _UNSEEN

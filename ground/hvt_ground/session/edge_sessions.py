@@ -208,7 +208,8 @@ class EdgeSessions:
             self._serve(session, now_ns)
         waits = self.receiver.unseen
         if waits is not None and self.receiver.silent_ns > self._patience_ns:
-            self._shows_or_ended()
+            self.receiver.unseen = None
+            self._say_unseen("")
         elif waits is not None and waits.lost and now_ns >= self._next_unseen_ns:
             self._next_unseen_ns = now_ns + _UNSEEN_EVERY_NS
             self._reports.send(waits.feedback)
@@ -295,10 +296,6 @@ class EdgeSessions:
                 self.receiver.skip_stranger(row, header.session_id)
         except WireError as error:
             self.receiver.skip(row, error)
-
-    def _shows_or_ended(self) -> None:
-        self.receiver.unseen = None
-        self._say_unseen("")
 
     def _say_unseen(self, reason: str) -> None:
         if not reason:

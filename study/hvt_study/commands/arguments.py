@@ -47,7 +47,7 @@ _USUAL: Mapping[str, dict[str, Any]] = {
     },
     "--cache": {"type": Path, "metavar": "DIR", "help": "finished flights (default: DIR/cache)"},
     "--classes": {
-        "default": "",
+        "default": None,
         "metavar": "NAME,…",
         "help": "class names of YOLO labels without classes.txt",
     },
@@ -75,7 +75,7 @@ _USUAL: Mapping[str, dict[str, Any]] = {
         "help": "processes at a time, each with one thread and the pictures of one sequence (default: the cores)",
     },
     "--labelled": {
-        "default": "",
+        "default": None,
         "metavar": "KIND,…",
         "help": "kinds that are labelled, such as vehicle; others are not judged (default: all that are named)",
     },
@@ -187,8 +187,8 @@ def check_whole(name: str, value: int, low: int, high: int | None = None) -> int
     return value
 
 
-def names_of(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
+def names_of(text: str | None) -> tuple[str, ...]:
+    return tuple(word.strip() for word in (text or "").split(",") if word.strip())
 
 
 def base_size(text: str) -> tuple[int, int]:

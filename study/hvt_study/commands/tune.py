@@ -204,7 +204,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     common.check_whole("--trials", arguments.trials, 1, _MOST_TRIALS)
     common.check_whole("--seed", arguments.seed, 0, _HIGHEST_SEED)
-    parameters = tunable(arguments.method, common.names_of(arguments.parameters or ""))
+    parameters = tunable(arguments.method, common.names_of(arguments.parameters))
     sequences = common.open_sequences(arguments)
     plan = common.study_plan(arguments, sequences)
     if len(plan.still_codecs) > 1:

@@ -164,10 +164,10 @@ def check_strange(place: Path, pictures: Sequence[Path]) -> None:
 
 def _holds_camera_poses(path: Path) -> bool:
     # Of TUM RGB-D, beside its folders of pictures: 1305031098.66 1.35 0.63 1.63 0.65 0.61 -0.29 -0.32
-    if path.name != "groundtruth.txt" or not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return b"," not in file.read(_LOOKED_AT)
+    if path.name == "groundtruth.txt":
+        with suppress(OSError), path.open("rb") as file:
+            return b"," not in file.read(_LOOKED_AT)
+    return False
 
 
 def class_file(place: Path, pictures: list[Path]) -> Path | None:

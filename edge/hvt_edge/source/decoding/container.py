@@ -122,7 +122,7 @@ def open_video(
             file = _GrowingFile(spec)
         try:
             container = av.open(file, options=options, timeout=(_OPEN_S, _READ_S))
-        except av.error.FFmpegError:
+        except (av.error.InvalidDataError, av.error.EOFError):
             if local:
                 raise
             # A server of one line at a time does not answer on a second one while the first is open.
