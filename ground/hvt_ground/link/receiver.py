@@ -72,6 +72,8 @@ class Unseen:
 
     first: Status
     since_ns: int
+    corrupt: int
+    """Access units that had come damaged by then."""
     came: set[bool] = field(default_factory=set)
     """Whether access units of the edge came: True for a keyframe, False for another."""
     lost: int = 0
@@ -221,10 +223,11 @@ class Receiver:
 
     def is_unseen(self, status: Status, now_ns: int) -> bool:
         """Whether the edge has said for long that it sends pictures of a session of which no keyframe comes."""
+        of = status.session_id, self.stream.counters.corrupt
         if status.state == "ended":
             self.unseen = None
-        elif self.unseen is None or self.unseen.first.session_id != status.session_id:
-            self.unseen = Unseen(status, now_ns)
+        elif self.unseen is None or (self.unseen.first.session_id, self.unseen.corrupt) != of:
+            self.unseen = Unseen(status, now_ns, of[1])
         return self.unseen is not None and self.unseen.note(status, now_ns)
 
     def hold(self, packet: Packet) -> None:
