@@ -115,6 +115,11 @@ class Observation:
         velocity = share * newest + (1 - share) * self.velocity
         return Observation(box, frame_index, confidence, velocity, self.steps + 1)
 
+    def stays(self, frames: int) -> bool:
+        """Whether the object is known to go less than half of its own size in so many frames."""
+        way = frames * float(np.abs(self.velocity).max())
+        return self.steps > 1 and way < float((self.box[2:] - self.box[:2]).max()) / 2
+
 
 @dataclass(slots=True)
 class Vote:
@@ -163,15 +168,21 @@ class Entity:
     last_frame: int = -1
     """The newest frame at which any source observed it."""
 
-    def is_report_live(self, frame_index: int, *, patience: int) -> bool:
-        """Whether the edge's knowledge of it, or a still's, holds at this frame."""
-        if self.reported is None or frame_index - self.reported.frame_index > patience:
+    def is_report_live(self, frame_index: int, *, patience: int, reach: int) -> bool:
+        """Whether the edge's knowledge of it, or a still's, holds at this frame, and says where it is."""
+        seen = self.reported
+        if seen is None or frame_index - seen.frame_index > patience:
             return False
-        return self.edge_id is None or self.missed < MISSED_STEPS
+        if self.edge_id is None:
+            return True
+        unknown = frame_index - seen.frame_index - reach
+        return self.missed < MISSED_STEPS and (unknown <= 0 or seen.stays(unknown))
 
-    def origin(self, own_ids: Container[int | None], frame_index: int, *, patience: int) -> Origin | None:
+    def origin(
+        self, own_ids: Container[int | None], frame_index: int, *, patience: int, reach: int
+    ) -> Origin | None:
         """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more)."""
-        observed = self.is_report_live(frame_index, patience=patience)
+        observed = self.is_report_live(frame_index, patience=patience, reach=reach)
         if self.own_id is not None and self.own_id in own_ids:
             return "edge+base" if observed and self.edge_id is not None else "base"
         if not observed:

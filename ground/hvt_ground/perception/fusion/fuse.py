@@ -21,7 +21,8 @@ than the base. The classes of stills come after, in `refine`, and stand above bo
 
 **Expiry.** All entities end where another scene begins. An edge's track ends when two steps in a row do not list it,
 or nothing has been reported of it for `PATIENCE_S`; if half of that passes from one step to the next, for twice the
-time between them. An entity that only a still has shown ends so long after the still.
+time between them. An entity that only a still has shown ends so long after the still. A box of the edge whose way
+since is not known, for it came once or is moving, is not listed after `REACH_S`: it would stand on an empty road.
 
 **Missed-detection evidence.** An edge-only entity is listed from a sure confidence on. If a step shows nothing at a
 ground-only one, of a class that the edge can name, it must be the surer the larger the share of objects is that the
@@ -354,7 +355,7 @@ class Fusion:
             self._entities.remove(old)
 
     def _is_edge_only(self, entity: Entity, frame_index: int) -> bool:
-        return entity.is_report_live(frame_index, patience=self._rules.patience)
+        return entity.is_report_live(frame_index, patience=self._rules.patience, reach=self._rules.reach)
 
     def _reported_boxes(self, entities: Sequence[Entity], frame_index: int) -> npt.NDArray[np.float64]:
         return reported_boxes(entities, frame_index, path=self.path, reach=self._rules.reach)

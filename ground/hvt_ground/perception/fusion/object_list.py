@@ -108,7 +108,7 @@ def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules, *, doubt
     rows: Mapping[int | None, int] = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
     lines = []
     for entity in entities:
-        origin = entity.origin(rows, own.frame_index, patience=rules.patience)
+        origin = entity.origin(rows, own.frame_index, patience=rules.patience, reach=rules.reach)
         unsure = (origin == "edge" and entity.edge_vote.confidence < EDGE_ONLY_CONFIDENCE) or (
             origin == "base" and doubting and entity.is_doubted
         )

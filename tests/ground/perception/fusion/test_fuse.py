@@ -109,6 +109,12 @@ FIND = "own 0 1=A; found 0 A+3 B; own 1 1=A"
         # Boxes of the edge would stand still and jump three times a second, more where the step comes late.
         ("own 0; step 0 70=A; step 5 70=A+20; own 8", "1=edge@A+32"),
         ("own 0; own 5; own 8; step 0 70=A; step 5 70=A+20; own 9", "1=edge@A+36"),
+        # A look of the edge that took long would put the car where it was, on an empty road.
+        ("own 0; step 0 70=A; own 15", "1=edge@A"),
+        ("own 0; step 0 70=A; own 16", ""),
+        ("own 0; step 0 70=A; step 5 70=A+20; own 20", "1=edge@A+80"),
+        ("own 0; step 0 70=A; step 5 70=A+20; own 25", ""),
+        ("own 0; step 0 70=A; step 5 70=A+20; own 25; step 25 70=A+100; own 26", "1=edge@A+104"),
         # Cars that have driven away, or the list of an edge that has gone silent, would stay on the screen.
         ("own 0; step 0 70=A 71=B; step 5 71=B; own 6", "1=edge 2=edge"),
         ("own 0; step 0 70=A 71=B; step 5 71=B; step 10 71=B; own 11", "2=edge@B"),
