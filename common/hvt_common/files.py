@@ -23,6 +23,7 @@ MOST_TABLE_BYTES = 1_000_000_000
 """Limit for labels and annotations of a whole dataset."""
 PIPE_WAIT_S = 10.0
 """The longest wait for a pipe's other end, and then for its content."""
+_LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
 _log = logging.getLogger(__name__)
 
 
@@ -175,6 +176,37 @@ def _is_gone(path: Path) -> bool:
     except OSError:  # nobody may look there, which says nothing
         return False
     return False
+
+
+def created(path: Path, flags: int = 0) -> int:
+    """A descriptor to write a new file with, in place of one of that name; until it is closed the file is locked.
+
+    Raises `OSError`, also where another program is at work on the file; a pipe or a device has no lock.
+    """
+    for _ in range(_LOCK_TRIES):
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | flags, 0o644)
+        found = os.fstat(file)
+        if not stat.S_ISREG(found.st_mode):
+            return file
+        # The index removes empty files that nobody has locked: this one perhaps, just now.
+        if takes_lock(file) and os.fstat(file).st_nlink:
+            if found.st_size:
+                os.ftruncate(file, 0)  # not before: another program may be writing it
+            return file
+        os.close(file)
+        time.sleep(_LOCK_PAUSE_S)
+    raise OSError(errno.EBUSY, "another program is at work on it")
+
+
+def takes_lock(file: int) -> bool:
+    """Whether a descriptor holds the lock of its file now; another program may, as long as it writes it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks: nobody can claim it either
+        return True
+    return True
 
 
 def claim_name(path: Path) -> bool:

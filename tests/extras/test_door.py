@@ -2,12 +2,15 @@
 
 import re
 import time
+from contextlib import closing
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 import hvt_edge.cli
+from hvt_archive.exports.tables import LineFile
+from hvt_archive.replay.message_log import MessageLog
 from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
@@ -21,12 +24,16 @@ from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_edge.video.encoder import check_encoder, encoder_names
 from hvt_edge.wiring.storing import open_local_copy
+from hvt_gateways.mcap.file import McapFile
+from hvt_gateways.transport_stream.destination import StreamFile
 from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import all_extras, config_class, locators
 from hvt_ground.perception.models import ModelFacts
 from hvt_ground.poses import NOWHERE
+from hvt_ground.sinks.rerun.recorder import Recorder
 from media.onnx_models import colour_classifier, colour_detector
+from programs.rrd import settings
 
 
 @pytest.mark.parametrize(
@@ -200,3 +207,26 @@ def test_without_geolocation_nothing_is_placed_and_a_model_names_its_extra(monke
     assert locators(None)("uav-1") is NOWHERE
     with pytest.raises(UserError, match=r"--terrain is of an extra .*: pip install 'hvt\[terrain\]'"):
         locators(Path("dem.tif"))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda path: Recorder(settings(path)),
+        lambda path: LineFile(path, ["column"]),
+        lambda path: MessageLog(path, most_bytes=1_000_000),
+        lambda path: McapFile(path, edge="uav-1"),
+        StreamFile,
+    ],
+)
+def test_a_file_that_another_ground_writes_is_left_alone(make, tmp_path):
+    """Two grounds with one FILE: the second cut the first one's flight down, and both wrote into what was left."""
+    path = tmp_path / "flight"
+    with closing(make(path)), path.open("ab") as first:
+        first.write(b"of the first ground")
+        first.flush()
+        before = path.read_bytes()
+        with pytest.raises(UserError, match="cannot be created: another program is at work on it"):
+            make(path)
+        assert path.read_bytes() == before
+    make(path).close()

@@ -174,14 +174,19 @@ def test_what_was_moved_stays_where_each_start_is_of_the_same_time(tmp_path, mon
     assert sorted(one.read_text() for one in tmp_path.glob("earlier-*/f.rrd")) == flights
 
 
-def test_nothing_is_moved_from_under_a_ground_that_still_records(tmp_path):
-    """A second one that is started by mistake would end the recording of the first."""
-    for one in ("f.rrd", "t.csv"):
+def test_nothing_is_moved_from_under_a_ground_that_still_writes_it(tmp_path):
+    """A second one that is started by mistake took its files from under the first."""
+    for one in ("f.rrd", "t.csv", "o.mcap"):
         (tmp_path / one).write_text(one)
-    with (tmp_path / "f.rrd").open() as recording:
-        fcntl.flock(recording, fcntl.LOCK_EX)
-        set_aside(read("--record", str(tmp_path / "f.rrd"), "--tracks", str(tmp_path / "t.csv")))
-    assert {one.name for one in tmp_path.iterdir()} == {"f.rrd", "t.csv"}
+    with (tmp_path / "t.csv").open() as table, (tmp_path / "o.mcap").open() as other:
+        for one in (table, other):
+            fcntl.flock(one, fcntl.LOCK_EX)
+        words = ["--record f.rrd", "--tracks t.csv", "--mcap o.mcap"]
+        given = [word.split() for word in words]
+        set_aside(read(*(word for option, name in given for word in (option, str(tmp_path / name)))))
+    (earlier,) = tmp_path.glob("earlier-*")
+    assert {one.name for one in tmp_path.iterdir()} == {"t.csv", "o.mcap", earlier.name}
+    assert [one.name for one in earlier.iterdir()] == ["f.rrd"]
 
 
 def test_two_grounds_of_one_folder_never_get_one_name(tmp_path):

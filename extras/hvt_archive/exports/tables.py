@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from hvt_common.errors import UserError, telling
-from hvt_common.files import check_there, has_nothing
+from hvt_common.files import check_there, created, has_nothing
 from hvt_common.units import utc_text
 from hvt_ground.events import Event, MessageTiming, Overlay, Places, Refinement, StillsRead
 from hvt_ground.sinks import Sink, SinkWriter
@@ -61,10 +61,9 @@ class LineFile(SinkWriter[str]):
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self.path: Path = path
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
         self._size_bytes, fresh = 0, has_nothing(path)
         with telling(f"table {path} cannot be created: "):
-            self._file = os.open(path, flags, 0o644)
+            self._file = created(path, os.O_APPEND)
         try:
             self.log(",".join(columns) + "\n")
         except UserError:

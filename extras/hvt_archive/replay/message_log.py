@@ -21,7 +21,7 @@ from typing import BinaryIO
 import msgpack
 
 from hvt_common.errors import UserError, telling
-from hvt_common.files import check_there, open_plain
+from hvt_common.files import check_there, created, open_plain
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
 from hvt_common.runtime.statistics import Newest
@@ -116,7 +116,7 @@ def _is_info(payload: bytes) -> bool:
 
 def _created(path: Path) -> BinaryIO:
     with telling(f"message log {path} cannot be created: "):
-        file = path.open("wb", buffering=0)
+        file = os.fdopen(created(path), "wb", buffering=0)
         file.write(_MAGIC)
         return file
 

@@ -6,6 +6,7 @@ Times are capture times. Topics begin with the edge's id, so that files of sever
 from __future__ import annotations
 
 import math
+import os
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -25,7 +26,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from mcap_protobuf.writer import Writer
 
 from hvt_common.errors import telling
-from hvt_common.files import check_there, has_nothing
+from hvt_common.files import check_there, created, has_nothing
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 from hvt_gateways.decodable import DecodableRun
@@ -55,7 +56,7 @@ class McapFile(SinkWriter[Event]):
         """The newest one: of several objects in it each has an event, and all together one picture."""
         fresh = has_nothing(path)
         with telling(f"MCAP file {path} cannot be created: "):
-            self._file: BinaryIO = path.open("wb")
+            self._file: BinaryIO = os.fdopen(created(path), "wb")
             try:
                 self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
                 self._file.flush()

@@ -18,7 +18,7 @@ import av
 import av.error
 
 from hvt_common.errors import UserError, named_path, telling
-from hvt_common.files import check_there, has_nothing
+from hvt_common.files import check_there, created, has_nothing
 from hvt_common.runtime.host_names import is_group, with_small_scheme
 
 _log = logging.getLogger(__name__)
@@ -182,9 +182,8 @@ class StreamFile:
 
     def __init__(self, path: Path) -> None:
         self._path, self._leaves_none = path, has_nothing(path)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
         with telling(f"MPEG-TS file {path} cannot be created: "):
-            self._file = os.open(path, flags, 0o644)
+            self._file = created(path)
 
     def write(self, data: bytes) -> int:
         left = memoryview(data)

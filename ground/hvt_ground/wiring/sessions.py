@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hvt_common.errors import NotYetError, UserError
-from hvt_common.files import claim_name, has_nothing
+from hvt_common.files import claim_name, has_nothing, takes_lock
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import Limit, bitrate_text
@@ -33,7 +33,6 @@ from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
 from hvt_ground.sinks.rerun.recorder import RecorderSettings
-from hvt_ground.sinks.rerun.rrd_file import locked
 
 _log = logging.getLogger(__name__)
 
@@ -90,12 +89,8 @@ def set_aside(config: GroundConfig) -> None:
     """Move named files of this run that an earlier one wrote to a folder ``earlier-<time>`` beside them.
 
     A supervisor starts a ground that died again with the same names, and a flight cannot be received twice. Nothing
-    is moved from under another ground that still writes its recording there.
+    is moved from under another ground that still writes it.
     """
-    if any(
-        suffix == ".rrd" and path.is_file() and _is_written(path) for _, path, suffix, _ in written(config)
-    ):
-        return
     stamp = f"earlier-{time.strftime('%Y%m%d-%H%M%S')}"
     stamps = chain([stamp], (f"{stamp}-{number}" for number in count_from(2)))
     # Without a battery the clock says the same at each start.
@@ -108,7 +103,7 @@ def set_aside(config: GroundConfig) -> None:
             continue
         folder = file.with_name(free)
         try:
-            if not file.stat().st_size:
+            if not file.stat().st_size or _is_written(file):
                 continue
             with suppress(OSError):  # on a full disk there may be no room for a folder, but for a name
                 folder.mkdir(exist_ok=True)
@@ -124,7 +119,7 @@ def set_aside(config: GroundConfig) -> None:
 def _is_written(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            return not locked(file.fileno())
+            return not takes_lock(file.fileno())
     except OSError:
         return False
 

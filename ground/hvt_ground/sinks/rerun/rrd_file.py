@@ -12,13 +12,11 @@ in memory for as long as it records. At the end the SDK writes the compacted chu
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import shutil
 import struct
 import threading
-import time
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -29,7 +27,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError, telling
-from hvt_common.files import check_there, has_nothing
+from hvt_common.files import check_there, created, has_nothing
 from hvt_common.runtime.failures import Turns
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
@@ -41,7 +39,6 @@ END = 0
 """The kind of a recording's footer."""
 _SPARE_BYTES = 2 * 2**20
 _FLUSH_S = 10.0
-_LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
 _filters = threading.Lock()
 """Warning filters are the process's."""
 
@@ -190,25 +187,5 @@ def _created(path: Path) -> int:
         )
     if not path.parent.is_dir():
         raise UserError(f"recording {path} cannot be created: its folder {path.parent} does not exist")
-    for _ in range(_LOCK_TRIES):
-        with telling(f"recording {path} cannot be created: "):
-            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        # The index removes empty files that nobody has locked: this one perhaps, just now.
-        if locked(file) and os.fstat(file).st_nlink:
-            if os.fstat(file).st_size:
-                os.ftruncate(file, 0)  # not before: another ground may be writing it
-            return file
-        os.close(file)
-        time.sleep(_LOCK_PAUSE_S)
-    raise UserError(f"recording {path} cannot be created: another program is at work on it")
-
-
-def locked(file: int) -> bool:
-    """Whether a descriptor holds the lock of its file now; another program may, as long as it writes a recording."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks: nobody can claim it either
-        return True
-    return True
+    with telling(f"recording {path} cannot be created: "):
+        return created(path)

@@ -476,14 +476,3 @@ def test_a_new_class_a_frame_fills_no_disk(tmp_path: Path, monkeypatch: pytest.M
     legend = Recording(path).rows("/base/legend", "Points2D:labels")[-1][2]
     assert (len(legend), "other" in legend) == (60, True)
     assert largest < 270_000
-
-
-def test_a_recording_that_another_ground_writes_is_left_alone(tmp_path: Path) -> None:
-    """Two grounds with one --record FILE.rrd: the second would cut the first one's flight down to nothing."""
-    path = tmp_path / "flight.rrd"
-    with Recorder(settings(path)) as first:
-        first.log(Notice(0, START_NS, "info", "of the first ground"))
-        before = path.read_bytes()
-        with pytest.raises(UserError, match="another program is at work on it"):
-            Recorder(settings(path, edge_id="uav-2"))
-        assert path.read_bytes() == before
