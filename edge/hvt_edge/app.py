@@ -36,7 +36,6 @@ from hvt_edge.source.live import SOURCE_PART
 from hvt_edge.wiring import (
     Flight,
     Stages,
-    as_the_camera_is,
     check_codecs,
     check_files,
     check_store,
@@ -44,6 +43,7 @@ from hvt_edge.wiring import (
     open_for_flight,
     qualify_encoder,
     say_size,
+    surveyed,
     try_scene,
     unopened,
 )
@@ -100,7 +100,8 @@ class Edge:
             source = stack.enter_context(self._source_when_there())
             for note in source.notes:
                 logging.getLogger(START_LOGGER).info("source: %s", note)
-            config = self._config = as_the_camera_is(config, source)
+            config, camera = surveyed(config, source)
+            self._config = config
             pose_source = world.open_pose(config, source)
             if pose_source is not None:
                 stack.callback(pose_source.close)
@@ -110,7 +111,7 @@ class Edge:
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
             say_size(config, source.view)
-            headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
+            headroom = qualify_encoder(config, source, camera, clock=world.clock, stop=self._stop)
             detector = self._open_detector(config, source)
             beginning = try_scene(config, source, detector=detector, clock=world.clock, stop=self._stop)
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
@@ -130,6 +131,7 @@ class Edge:
                 loop_clock=self._loop_clock,
                 beginning=beginning,
                 headroom=headroom,
+                camera=camera,
             )
             stages = Stages(flight, pose_source=pose_source)
             self._heartbeat = stages.heartbeat

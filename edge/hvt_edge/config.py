@@ -464,7 +464,7 @@ def note_on_share(config: EdgeConfig, *, given: Mapping[str, Any]) -> str:
 def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
     """Raise `UserError` if the budget cannot carry a base stream of this size; a camera's rate is measured instead.
 
-    See `least_budget_bps`, and for a camera `hvt_edge.video.passthrough`.
+    See `least_budget_bps`.
     """
     if config.passes_through:
         return

@@ -19,7 +19,7 @@ from hvt_edge.link.publisher import EdgeLink, ZenohLink
 from hvt_edge.loop.pose import PoseSource, PoseTable, open_pose
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.opening import Source, open_source, shown
-from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_up_for
+from hvt_edge.wiring import base_size, make_detector, make_link_settings, passthrough, warm_up_for
 
 
 class World:
@@ -44,7 +44,8 @@ class World:
     def open_source(self, config: EdgeConfig) -> Source:
         """Open ``--source``; errors are those of `hvt_edge.source.opening.open_source`."""
         assert config.source is not None, "check() refuses a missing source"
-        return open_source(
+        opener = passthrough().open_source if config.passes_through else open_source
+        return opener(
             config.source,
             size=base_size(config),
             fps=config.nominal_fps,
@@ -52,7 +53,6 @@ class World:
             seed=config.seed,
             max_frames=config.max_frames,
             source_fps=config.source_fps,
-            coded=config.passes_through,
             growing=config.follow,
             clock=self.clock,
             failures=self.failures,

@@ -28,7 +28,7 @@ from hvt_edge.source.opening import shown
 from hvt_edge.video.encoder import Encoder
 from hvt_edge.video.rate_model import PresetChoice, choose_preset, share_of
 from hvt_edge.wiring import (
-    as_the_camera_is,
+    Camera,
     check_codecs,
     check_files,
     check_store,
@@ -38,6 +38,7 @@ from hvt_edge.wiring import (
     make_link_settings,
     qualify_encoder,
     store_folder,
+    surveyed,
 )
 from hvt_edge.world import World
 from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findings, run_checks
@@ -75,6 +76,7 @@ class _Checks:
         self._config = config
         self._world = World()
         self._source: Source | None = None
+        self._camera: Camera | None = None
         self._detector: Detector | None = None
         self._frames: list[Frame] = []
         self._detect_s = 0.0
@@ -104,7 +106,7 @@ class _Checks:
         name = shown(str(config.source))
         source = self._world.open_source(config)
         try:
-            self._config = as_the_camera_is(config, source)
+            self._config, self._camera = surveyed(config, source)
         except UserError:
             source.close()
             raise
@@ -163,7 +165,7 @@ class _Checks:
                 "unknown", f"stills work ({config.still_codec}); no picture to code without a source"
             )
         size = self._source.view.base_size
-        qualify_encoder(config, self._source, clock=self._world.clock, stop=threading.Event())
+        qualify_encoder(config, self._source, self._camera, clock=self._world.clock, stop=threading.Event())
         encoder = self._encoder(size)
         picture = BaseDecoder(size=size).decode_yuv(encoder.encode(self._frames[0], keyframe=True).data)
         if picture is None:

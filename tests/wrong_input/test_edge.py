@@ -76,7 +76,7 @@ def test_a_source_that_is_not_there(edge, here):
         ("method", "m5", "M5"),
         ("regime", "high", "low, moderate"),
         ("preset", "placebo", "ultrafast"),
-        ("encoder", "x266", "x265, passthrough, hevc_nvenc, hevc_qsv, hevc_v4l2m2m"),
+        ("encoder", "x266", "x265, hevc_nvenc, hevc_qsv, hevc_v4l2m2m, passthrough"),
         ("pace", "fast", "realtime, lockstep"),
         ("fit", "stretch", "letterbox, crop"),
         ("candidates", "both", "choose one of"),

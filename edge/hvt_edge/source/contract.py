@@ -10,7 +10,6 @@ from concurrent.futures import wait
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Self
 
 from hvt_common.errors import UserError
@@ -38,35 +37,6 @@ class SourceSettings:
     growing: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class SeenUnit:
-    """One access unit that was surveyed before the flight."""
-
-    at_s: float
-    """The camera's time stamp, from its first unit on."""
-    size_bytes: int
-    """Size with the parameter sets that are put before a keyframe."""
-    keyframe: bool
-
-
-@dataclass(frozen=True, slots=True)
-class CameraStream:
-    """The stream as measured before the flight: the first minutes of a file, some seconds of a camera."""
-
-    units: tuple[SeenUnit, ...]
-    """The first is a keyframe."""
-    fps: float
-    """The frame rate by its time stamps."""
-
-    @property
-    def keyframe_s(self) -> float:
-        """The longest time from one keyframe to the next; without a second one, the time surveyed."""
-        times = [unit.at_s for unit in self.units if unit.keyframe]
-        return max(
-            (later - earlier for earlier, later in pairwise([*times, self.units[-1].at_s])), default=0.0
-        )
-
-
 class Source(ABC):
     """Frames at the base rate and size, in order. A context manager; use it from one thread."""
 
@@ -88,13 +58,8 @@ class Source(ABC):
     """Frames of a live source beyond the base rate."""
     restarts: int = 0
     """How often a live source was opened again."""
-    camera_stream: CameraStream | None = None
-    """The survey of the camera's own HEVC, if each frame comes with its unit of it (`Frame.camera_unit`). A missing
-    index is a unit that was lost."""
     notes: tuple[str, ...] = ()
     """The decisions and guesses about it before the flight and their reasons, a sentence each."""
-    warning: str = ""
-    """The effect of the camera's own stream on the picture, in a sentence; empty for none."""
 
     @abstractmethod
     def frames(self, *, start_ns: int) -> Iterator[Frame]:

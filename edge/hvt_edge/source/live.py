@@ -17,7 +17,6 @@ from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, Image
-from hvt_edge.source.camera_stream import CameraDecoder
 from hvt_edge.source.contract import IDLE_S, BaseSize, Notes, Source, SourceSettings
 from hvt_edge.source.resample import Gate, Resizer
 
@@ -39,23 +38,13 @@ def patience_s(fps: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class CameraPacket:
-    """A frame as coded by the camera; packets of one decoder come in order, and it needs each of them."""
-
-    data: bytes
-    at_s: float | None
-    """The stream's own time stamps; None without any."""
-    decoder: CameraDecoder
-
-
-@dataclass(frozen=True, slots=True)
 class Shot:
     """A grabbed frame that is converted to BGR only if it is wanted."""
 
     image: Callable[[], Image]
     camera_ns: int | None = None
     """Capture time by the camera's own clock, Unix nanoseconds; None where it gives none."""
-    packet: CameraPacket | None = None
+    packet: object = None
     """For ``--encoder passthrough``; ``image`` then decodes it, and is not called otherwise."""
     missed: int = 0
     """Frames that came between the one before and this one, and were not taken in time."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from hvt_common.errors import FlightError, NotYetError, UserError, absent, named_path
 from hvt_common.redaction import HIDDEN, redacted
@@ -13,8 +14,6 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.host_names import with_small_scheme
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
-from hvt_edge.source.camera_stream import REENCODE
-from hvt_edge.source.coded import CodedLiveSource, CodedStreamGrabber, CodedVideoSource
 from hvt_edge.source.contract import BaseSize, Source, SourceSettings, check_shape
 from hvt_edge.source.decoding.container import is_local
 from hvt_edge.source.demo import DemoSource, is_demo
@@ -23,7 +22,7 @@ from hvt_edge.source.live import LiveSource, patience_s
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber, is_description
 from hvt_edge.source.video import VideoSource
 
-__all__ = ["REENCODE", "Source", "check_shape", "open_source", "shown"]
+__all__ = ["Source", "check_shape", "open_source", "shown"]
 
 _ACCEPTED = (
     "a video file, a folder of images, rtsp://…, rtmp://…, http://…, udp://…, FILE.sdp, /dev/videoN, demo or "
@@ -33,7 +32,18 @@ _PIPE = re.compile(r"-|(?:pipe|fd):.*|/dev/(?:stdin|fd/.*)|.*\s!\s.*", re.DOTALL
 """Ways to write standard input, and a pipeline of GStreamer."""
 
 
-def open_source(  # noqa: PLR0911 - one return a kind of source
+class SourceKinds(NamedTuple):
+    """The classes with which streams and clips are opened; ``--encoder passthrough`` has its own."""
+
+    grabber: Callable[..., StreamGrabber]
+    live: Callable[..., Source]
+    clip: Callable[[str, SourceSettings], Source]
+
+
+_DECODED = SourceKinds(StreamGrabber, LiveSource, VideoSource)
+
+
+def open_source(
     spec: str,
     *,
     size: BaseSize,
@@ -42,7 +52,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     seed: int = 0,
     max_frames: int | None = None,
     source_fps: float | None = None,
-    coded: bool = False,
+    kinds: SourceKinds = _DECODED,
     growing: bool = False,
     clock: Callable[[], int] | None = None,
     failures: Failures | None = None,
@@ -53,8 +63,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     ``fps`` is above 0 and at most 240; for ``fit`` see `View.fitted`. ``source_fps`` is the rate at which the
     images of a folder were taken (default: the base rate), or overrides a video file's own time stamps. ``clock``
     is a live source's, Unix nanoseconds without steps, and ``failures`` records its outages; None for its own.
-    A ``growing`` file is read while it grows. With ``coded`` each frame comes with the camera's own unit of it,
-    at the camera's rate, whatever ``fps`` is.
+    A ``growing`` file is read while it grows.
     Raises `UserError` if nothing usable is there, or size or rate are impossible; `FlightError` if a disk may come.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
@@ -62,33 +71,27 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps, growing=growing
     )
     clock = clock or SteadyClock()
-    if coded:
-        _check_coded(spec)
     if is_demo(spec):
         return DemoSource(spec, settings, seed=seed)
-    if spec.startswith("~") and not _is_there(spec):  # no shell replaces it in --source=~/clip.mp4
+    if spec.startswith("~") and not is_there(spec):  # no shell replaces it in --source=~/clip.mp4
         spec = str(named_path(spec, name="source"))
     spec = spec if is_local(spec) else with_small_scheme(spec)
     scheme = "" if is_local(spec) else spec.partition("://")[0]
-    if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
+    if scheme in LIVE_SCHEMES or (is_description(spec) and is_there(spec)):
         _check_address(spec, scheme)
-        stream = (CodedStreamGrabber if coded else StreamGrabber)(spec, read_s=patience_s(fps))
+        stream = kinds.grabber(spec, read_s=patience_s(fps))
         stream.open()
-        if isinstance(stream, CodedStreamGrabber) and not stream.holds_a_clip:
-            return CodedLiveSource(stream, settings, clock=clock, failures=failures)
         if not stream.holds_a_clip:
-            return LiveSource(stream, settings, clock=clock, failures=failures)
+            return kinds.live(stream, settings, clock=clock, failures=failures)
         stream.close()
-    elif _is_device(spec):
+    elif is_device(spec):
         grabber = CameraGrabber(spec, fps=fps, clock=clock)
         return LiveSource(grabber, settings, clock=clock, failures=failures)
     else:
         _check_there(spec, scheme, growing=growing)
-    if coded:
-        return CodedVideoSource(spec, settings)
-    if not scheme and (Path(spec).is_dir() or is_tiff(spec)):
+    if not scheme and (Path(spec).is_dir() or (is_tiff(spec) and kinds is _DECODED)):
         return FolderSource(spec, settings)
-    return VideoSource(spec, settings)
+    return kinds.clip(spec, settings)
 
 
 def _check_address(spec: str, scheme: str) -> None:
@@ -106,7 +109,7 @@ def _check_address(spec: str, scheme: str) -> None:
 
 def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
     # A file that another program writes may be yet to come: `NotYetError`.
-    if not _is_played(spec) and (_is_there(spec) or _PIPE.fullmatch(spec)):
+    if not _is_played(spec) and (is_there(spec) or _PIPE.fullmatch(spec)):
         raise UserError(
             f"source {shown(spec)!r} is neither a file nor a folder; what a program writes into a pipe, or GStreamer "
             "plays, can be sent to udp://127.0.0.1:PORT as MPEG-TS"
@@ -114,7 +117,7 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
     if scheme:
         known = scheme if re.fullmatch(r"[a-z][a-z0-9+.-]{0,15}", scheme) else HIDDEN
         raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
-    if not _is_there(spec):
+    if not is_there(spec):
         mistyped = not re.match(r"/[^/]", spec) and shown(spec) != spec
         if not growing and not mistyped and absent(Path(spec)) is NotYetError:
             raise FlightError(
@@ -129,30 +132,20 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
 
 def shown(spec: str) -> str:
     """``--source`` as it may be printed: a file, a device and the demo as they are."""
-    return spec if is_demo(spec) or _is_there(spec) else redacted(spec)
+    return spec if is_demo(spec) or is_there(spec) else redacted(spec)
 
 
-def _is_device(spec: str) -> bool:
+def is_device(spec: str) -> bool:
     # An existing file or folder there is no device, as in /dev/shm.
     return spec.startswith("/dev/") and not (_is_played(spec) or _PIPE.fullmatch(spec))
 
 
 def _is_played(spec: str) -> bool:
-    return _is_there(spec, Path.is_file) or _is_there(spec, Path.is_dir)
+    return is_there(spec, Path.is_file) or is_there(spec, Path.is_dir)
 
 
-def _is_there(spec: str, kind: Callable[[Path], bool] = Path.exists) -> bool:
+def is_there(spec: str, kind: Callable[[Path], bool] = Path.exists) -> bool:
     try:
         return bool(spec) and kind(Path(spec))
     except (OSError, ValueError):  # too long for a name, or with a character that no name has
         return False
-
-
-def _check_coded(spec: str) -> None:
-    # Raise `UserError` for anything but coded video; whether it is HEVC is checked when it is open.
-    kind = "the drawn demo" * is_demo(spec) or "a device" * _is_device(spec)
-    if kind := kind or "a folder" * _is_there(spec, Path.is_dir):
-        raise UserError(
-            f"source {shown(spec)!r} is {kind}, and --encoder passthrough takes a video file or a stream that is "
-            f"HEVC already: {REENCODE}"
-        )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from fractions import Fraction
 from typing import TypeVar
 
@@ -17,7 +16,7 @@ import cv2
 import numpy as np
 
 from hvt_common.units import SECOND_NS
-from hvt_common.values import CameraUnit, Fit, Frame, Image, View
+from hvt_common.values import Fit, Frame, Image, View
 from hvt_edge.source.contract import BaseSize
 
 _log = logging.getLogger(__name__)
@@ -120,10 +119,6 @@ class Resizer:
         if said := self._condition.note(base, at_ns=capture_ns):
             _log.warning("%s: %s", self._name, said)
         return Frame(index=index, capture_ns=capture_ns, source_bgr=whole, base_bgr=base)
-
-    def coded_frame(self, picture: Image, unit: CameraUnit, *, index: int, capture_ns: int) -> Frame:
-        """The frame of a camera's own unit, of which ``picture`` was decoded: source and base are the same."""
-        return replace(self.frame(picture, index=index, capture_ns=capture_ns), camera_unit=unit)
 
     def _tell_size(self, wide: int, high: int) -> None:
         if (wide, high) not in self._sizes and len(self._sizes) < _MOST_SIZES:

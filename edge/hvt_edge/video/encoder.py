@@ -1,7 +1,7 @@
 """The frame loop's contract with an encoder, its settings from a budget in line bits, and all encoders by name.
 
-There are x265, none (passthrough), and those that packages install, as an extra the hardware encoders: an entry point
-of the group ``hvt.encoders`` (`MakeEncoder`), imported when it is named.
+There are x265 and those that packages install, as an extra the hardware encoders and passthrough: an entry point of
+the group ``hvt.encoders`` (`MakeEncoder`), imported when it is named.
 """
 
 from __future__ import annotations
@@ -240,26 +240,25 @@ class CheckedEncoder:
         del self._encoder
 
 
-GROUP = "hvt.encoders"
+ENCODERS = "hvt.encoders"
 X265 = "x265"
 """HVT's own, measured encoder: the only one that takes regions and needs no qualification."""
 PASSTHROUGH = "passthrough"
 """No encoder: the units come from a camera that makes HEVC itself."""
 _WHAT = "encoder"
-_OWN = (X265, PASSTHROUGH)
-_BROUGHT = ("hevc_nvenc", "hevc_qsv", "hevc_v4l2m2m")
+_BROUGHT = (PASSTHROUGH, "hevc_nvenc", "hevc_qsv", "hevc_v4l2m2m")
 """Those of the extra that comes with HVT."""
 
 
 def encoder_names() -> tuple[str, ...]:
     """The values of ``--encoder`` here: HVT's own first, whether or not the device is there; none is loaded."""
-    return (*_OWN, *sorted(installed(GROUP).keys() - set(_OWN)))
+    return (X265, *sorted(installed(ENCODERS).keys() - {X265}))
 
 
 def check_encoder(name: str) -> None:
     """Raise `UserError` if no encoder has that name, or more than one; nothing is opened."""
-    built_in = name in _OWN
-    entry = the_one(GROUP, name, what=_WHAT, built_in=built_in)
+    built_in = name == X265
+    entry = the_one(ENCODERS, name, what=_WHAT, built_in=built_in)
     if entry is None and name in _BROUGHT:
         raise UserError(f"--encoder {name} is of an extra that is not installed: pip install 'hvt[edge]'")
     if not built_in and entry is None:
@@ -269,15 +268,12 @@ def check_encoder(name: str) -> None:
 def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     """Open the encoder. Raises `UserError` if there is none, or it does not load or refuses the settings."""
     # Imported only to open one: at each start only names are checked.
-    from hvt_edge.video.passthrough import Passthrough  # noqa: PLC0415
     from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
 
     if name == X265:
         return BaseEncoder(settings)
-    if name == PASSTHROUGH:
-        return Passthrough()
     check_encoder(name)
-    entry = the_one(GROUP, name, what=_WHAT, built_in=False)
+    entry = the_one(ENCODERS, name, what=_WHAT, built_in=False)
     assert entry is not None, "checked"
     return CheckedEncoder(loaded(entry, lambda make: make(settings), what=_WHAT))
 

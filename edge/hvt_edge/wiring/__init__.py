@@ -6,12 +6,14 @@ from hvt_edge.wiring.stages import Flight, Stages
 from hvt_edge.wiring.storing import check_files, check_store, store_folder
 from hvt_edge.wiring.trial import Beginning, try_scene
 from hvt_edge.wiring.video import (
-    as_the_camera_is,
+    Camera,
     base_size,
     default_size,
     first_decimation,
     first_rates,
     make_encoder,
+    passthrough,
     qualify_encoder,
     say_size,
+    surveyed,
 )

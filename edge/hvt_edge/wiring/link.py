@@ -10,14 +10,11 @@ from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.auto import AutoSettings
-from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder import least_base_bps
-from hvt_edge.video.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
-from hvt_edge.video.reconfigure import EncoderReconfiguration, Split
+from hvt_edge.video.reconfigure import Split
 from hvt_edge.wiring.perception import shows_details
-from hvt_edge.wiring.video import least_rate_bps
+from hvt_edge.wiring.video import Camera, least_rate_bps
 
 _AUTO_STILL_SHARE = 0.15
 """Share of the budget, at most, for stills that are not known to pay: the base loses .015 of F1 by it."""
@@ -86,47 +83,13 @@ def auto_settings(config: EdgeConfig, view: View) -> AutoSettings:
     return AutoSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
 
 
-def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int, int]) -> Pacer | None:
+def make_pacer(config: EdgeConfig, camera: Camera | None, size: tuple[int, int]) -> Pacer | None:
     """The pacer, which tracks the link's rate; None where the budget stays as it is.
 
-    For a passed-through camera (``stream``) the rate is never below the camera's surveyed rate.
+    The rate is never below the need of a passed-through ``camera``.
     """
     if not config.adapts:
         return None
-    floor_bps = least_rate_bps(config, size)
-    if stream is not None:
-        needs = needed_bps(
-            _surveyed_bytes(config, stream),
-            window_s=config.window,
-            share=config.share,
-            metadata_bps=config.metadata_bps,
-        )
-        floor_bps = max(floor_bps, needs)
+    floor_bps = max(least_rate_bps(config, size), 0 if camera is None else camera.needed_bps)
     floor_bps = min(config.budget_bps, floor_bps)
     return Pacer(RateController(ceiling_bps=config.budget_bps, floor_bps=floor_bps))
-
-
-def make_camera_rates(
-    config: EdgeConfig, stream: CameraStream, reconfiguration: EncoderReconfiguration
-) -> CameraRates:
-    """Make the rates that change at the keyframes of a passed-through camera."""
-    return CameraRates(
-        reconfiguration,
-        share=config.share,
-        least_bps=config.min_budget_bps,
-        surveyed_bytes=_surveyed_bytes(config, stream),
-        window_s=config.window,
-    )
-
-
-def make_least_link(config: EdgeConfig, line: Transmitter) -> LeastLink | None:
-    """Make the bound on a camera's queued units; None if nothing measures the link."""
-    if (pacer := line.pacer) is None:
-        return None
-    return LeastLink(
-        config.floor_bps, unreported_bytes=lambda: line.in_flight.size_bytes if pacer.measures else 0
-    )
-
-
-def _surveyed_bytes(config: EdgeConfig, stream: CameraStream) -> int:
-    return measure_camera(stream, window_s=config.window, edge_id=config.edge_id).window_bytes

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.view_trust import ViewTrust, trust_from
@@ -42,7 +43,6 @@ from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
-from hvt_edge.video.passthrough import PassthroughStage
 from hvt_edge.video.rate_model import PresetControl, share_of
 from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.stage import BaseStage, LocalCopy
@@ -51,8 +51,6 @@ from hvt_edge.wiring.link import (
     auto_settings,
     channels_of,
     make_budget,
-    make_camera_rates,
-    make_least_link,
     make_pacer,
     make_split,
 )
@@ -60,6 +58,7 @@ from hvt_edge.wiring.perception import make_analyzer, make_maker, make_method, m
 from hvt_edge.wiring.storing import open_local_copy, store_folder
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
+    Camera,
     encoder_plan,
     make_frame_skip,
     make_keyframes,
@@ -87,6 +86,8 @@ class Flight:
     beginning: Beginning
     headroom: float = 1.0
     """The share of its rate that the encoder is set to (`qualify_encoder`)."""
+    camera: Camera | None = None
+    """None where an encoder codes the frames."""
 
     @property
     def lockstep(self) -> bool:
@@ -110,8 +111,8 @@ class Link:
             preset=beginning.preset.preset,
             preset_says=beginning.preset.says,
         )
-        self.keyframes = make_keyframes(config, flight.source)
-        self.pacer = make_pacer(config, flight.source.camera_stream, size)
+        self.keyframes = make_keyframes(config, flight.camera)
+        self.pacer = make_pacer(config, flight.camera, size)
         presets = None
         if config.auto_preset:
             presets = PresetControl(
@@ -236,7 +237,7 @@ class Video:
     """The base stream: the stage that codes it or passes it through, and the control that admits its frames."""
 
     def __init__(self, flight: Flight, link: Link, stills: Stills, *, local_copy: LocalCopy | None) -> None:
-        config, source, failures = flight.config, flight.source, flight.failures
+        config, failures = flight.config, flight.failures
         self.control = LinkControl(
             has_ground=flight.ends.has_ground,
             has_subscriber=partial(flight.ends.has_subscriber, Channel.BASE),
@@ -247,29 +248,23 @@ class Video:
             stills=stills.stage.sender,
             failures=failures,
         )
-        if config.passes_through:
-            assert source.camera_stream is not None, "checked by as_the_camera_is"
-            self.stage: BaseStage = PassthroughStage(
-                link.encoder,
-                keyframes=link.keyframes,
-                transmitter=link.transmitter,
-                failures=failures,
-                local_copy=local_copy,
-                rates=make_camera_rates(config, source.camera_stream, link.reconfiguration),
-                least_link=make_least_link(config, link.transmitter),
-                admits=self.control.admits,
-                holder=self.control.holder,
-                pause=None if flight.lockstep else flight.loop_clock.pause,
-                backlog=stills.backlog,
-            )
+        parts: dict[str, Any] = {
+            "keyframes": link.keyframes,
+            "transmitter": link.transmitter,
+            "failures": failures,
+            "local_copy": local_copy,
+            "admits": self.control.admits,
+            "holder": self.control.holder,
+            "backlog": stills.backlog,
+        }
+        if flight.camera is not None:
+            pause = None if flight.lockstep else flight.loop_clock.pause
+            self.stage = flight.camera.make_stage(link.encoder, link.reconfiguration, pause=pause, **parts)
             return
-        size = source.view.base_size
+        size = flight.source.view.base_size
         self.stage = BaseStage(
             link.encoder,
             encoder_name=config.encoder,
-            keyframes=link.keyframes,
-            transmitter=link.transmitter,
-            local_copy=local_copy,
             first_keyframe_bytes=link.operating.now.base_bps // 40,  # .2 s: the limit of the VBV
             regions=TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None,
             frame_skip=make_frame_skip(
@@ -280,11 +275,8 @@ class Video:
             ),
             reconfigure=link.reconfiguration,
             keyframe_bytes=link.reconfiguration.keyframe_bytes,
-            admits=self.control.admits,
-            holder=self.control.holder,
-            backlog=stills.backlog,
             open_again=None if flight.lockstep else link.reconfiguration.open_again,
-            failures=failures,
+            **parts,
         )
 
 

@@ -7,18 +7,19 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 from hvt_common.config import AUTO
-from hvt_common.errors import UserError
 from hvt_common.runtime.log import START_LOGGER
+from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Fit, Frame, View
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, least_budget_bps
 from hvt_edge.operating import Keyframes, KeyframeSettings, Operating, Rates
 from hvt_edge.source.contract import BaseSize, Source, size_within
-from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder import (
+    ENCODERS,
+    PASSTHROUGH,
     SLOWEST,
     X265,
     Encoder,
@@ -28,7 +29,6 @@ from hvt_edge.video.encoder import (
     payload_bps,
     usual_keyframe_bytes,
 )
-from hvt_edge.video.passthrough import about_keyframes, check_camera
 from hvt_edge.video.qualification import Allowed, allowed, headroom_of, run_frames
 from hvt_edge.video.rate_model import (
     LEAST_SIDE_PX,
@@ -41,6 +41,7 @@ from hvt_edge.video.rate_model import (
     sizes_of,
 )
 from hvt_edge.video.reconfigure import EncoderReconfiguration
+from hvt_edge.video.stage import BaseStage
 
 _log = logging.getLogger(__name__)
 
@@ -50,12 +51,60 @@ _AUTO_LEAST_FPS = 7.5
 frame then still takes less time than a keyframe."""
 _MOST_SILENT_S = 10
 """After this many seconds without a frame a live source has no scene to try an encoder on."""
-_SAME_RATE = 0.02
-"""Largest difference of a camera's rate from --fps: 29.97 is 30."""
 _REST_S = 10.0
 """Least seconds between two decisions of ``--fps auto``."""
 _AUTO_WINDOW_S = 1.0
 """Window of its measurement with ``--profile auto``."""
+
+
+class Camera(Protocol):
+    """A source whose own units are sent (``--encoder passthrough``), as it was surveyed before the flight."""
+
+    fps: float
+    keyframe_s: float
+    """The longest time from one keyframe to the next."""
+    needed_bps: int
+    """The least rate of the link with which its fullest window has room."""
+
+    def qualify(self, limit: Allowed) -> None:
+        """Log the measurement. Raises `UserError` where it exceeds the limit."""
+
+    def make_stage(
+        self,
+        encoder: Encoder,
+        reconfiguration: EncoderReconfiguration,
+        *,
+        pause: Callable[[int], int] | None,
+        **parts: Any,
+    ) -> BaseStage:
+        """The stage that sends the units; ``parts`` are those of every `BaseStage`."""
+        ...
+
+
+class Passthrough(Protocol):
+    """The extra's entry point. Called with the `EncoderSettings` it is also a `MakeEncoder`."""
+
+    def open_source(self, spec: str, **settings: Any) -> Source:
+        """As `hvt_edge.source.opening.open_source`; each frame has its `CameraUnit`."""
+        ...
+
+    def survey(self, config: EdgeConfig, source: Source) -> Camera:
+        """Raises `UserError` where its units cannot be the base stream."""
+        ...
+
+
+def passthrough() -> Passthrough:
+    entry = the_one(ENCODERS, PASSTHROUGH, what="encoder", built_in=False)
+    assert entry is not None, "config.check() refuses an encoder that is not installed"
+    return cast("Passthrough", loaded(entry, lambda found: found, what="encoder"))
+
+
+def surveyed(config: EdgeConfig, source: Source) -> tuple[EdgeConfig, Camera | None]:
+    """The settings with the camera's frame rate, and the camera; None where an encoder codes the frames."""
+    if not config.passes_through:
+        return config, None
+    camera = passthrough().survey(config, source)
+    return replace(config, fps=camera.fps), camera
 
 
 def base_size(config: EdgeConfig) -> BaseSize:
@@ -193,7 +242,12 @@ def _allowed(config: EdgeConfig, size: tuple[int, int], rates: Rates) -> Allowed
 
 
 def qualify_encoder(
-    config: EdgeConfig, source: Source, *, clock: Callable[[], int], stop: threading.Event
+    config: EdgeConfig,
+    source: Source,
+    camera: Camera | None,
+    *,
+    clock: Callable[[], int],
+    stop: threading.Event,
 ) -> float:
     """The share of its rate to set at the encoder, from three seconds of the scene; 1 for x265, without a run.
 
@@ -202,10 +256,10 @@ def qualify_encoder(
     """
     if config.encoder == X265:
         return 1.0
-    if config.passes_through:
-        _qualify_camera(config, source)
-        return 1.0
     size = source.view.base_size
+    if camera is not None:
+        camera.qualify(_allowed(config, size, first_rates(config, 1)))
+        return 1.0
     rates = first_rates(config, decimation := first_decimation(config, size))
     limit = _allowed(config, size, rates)
     count = run_frames(config.nominal_fps / decimation, limit)
@@ -238,34 +292,6 @@ def scene(
             return
 
 
-def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
-    """The settings with the camera's frame rate, if its own units are sent; raises `UserError` if they cannot be."""
-    stream, name = source.camera_stream, shown(str(config.source))
-    if not config.passes_through:
-        return config
-    if stream is None:
-        raise UserError(
-            f"source {name} gives no video that is coded already, which --encoder passthrough takes: "
-            f"{REENCODE}"
-        )
-    if not config.auto_fps and abs(config.nominal_fps / stream.fps - 1) > _SAME_RATE:
-        raise UserError(
-            f"source {name} gives {stream.fps:g} frames a second, --fps is {config.nominal_fps:g}, and "
-            f"--encoder passthrough leaves none out: leave --fps out, or {REENCODE}"
-        )
-    return replace(config, fps=stream.fps)
-
-
-def _qualify_camera(config: EdgeConfig, source: Source) -> None:
-    stream, name = source.camera_stream, shown(str(config.source))
-    assert stream is not None, "checked by as_the_camera_is"
-    limit = _allowed(config, source.view.base_size, first_rates(config, 1))
-    found = check_camera(name, stream, limit, budget_bps=config.budget_bps, edge_id=config.edge_id)
-    logging.getLogger(START_LOGGER).info("%s", found)
-    for warning in filter(None, (about_keyframes(name, stream), source.warning)):
-        _log.warning("%s", warning)
-
-
 def make_reconfiguration(
     config: EdgeConfig, operating: Operating, size: tuple[int, int], **parts: Any
 ) -> EncoderReconfiguration:
@@ -287,7 +313,7 @@ def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
 
     No keyframe can be smaller than `keyframe_floor_bytes`. If the rate fell below a keyframe's need, none would be
     sent; then nothing arrives, and a rate that grows with arrivals never grows again. The need of a camera's own
-    units is measured (`hvt_edge.video.passthrough`).
+    units is measured (`Camera.needed_bps`).
     """
     if config.passes_through:
         return config.min_budget_bps
@@ -297,12 +323,10 @@ def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
     return max(config.min_budget_bps, needed_bps)
 
 
-def make_keyframes(config: EdgeConfig, source: Source) -> Keyframes:
+def make_keyframes(config: EdgeConfig, camera: Camera | None) -> Keyframes:
     """The control of keyframes, on a long schedule and on demand; a camera makes its own."""
-    if config.passes_through:
-        assert source.camera_stream is not None, "checked by as_the_camera_is"
-        every_s = source.camera_stream.keyframe_s
-        return Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=every_s))
+    if camera is not None:
+        return Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=camera.keyframe_s))
     interval_s = config.keyframe_interval
     if isinstance(interval_s, str):
         interval_s = keyframe_interval_s(config.fixed_size or DEFAULT_SIZE, config.base_bps)

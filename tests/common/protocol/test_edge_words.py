@@ -36,6 +36,7 @@ PARTS = (
     ("common/hvt_common", r"(?:Awaited|Retried)\([^\"]*?\"([\w ]+)\""),
     ("extras/hvt_models/detectors/ensemble.py", r"^_PART_NAMES = (.*)$"),
     ("extras/hvt_archive/local_copy.py", r"^_PART = (.*)$"),
+    ("extras/hvt_codecs", r"^_PART = (.*)$"),
     ("extras/hvt_fleet/health/server.py", r"Awaited\([^\"]*?\"([\w ]+)\""),
     ("edge/hvt_edge/link/publisher.py", r"self\._answered\(Channel\.(\w+)"),
 )

@@ -13,9 +13,11 @@ import av
 import numpy as np
 import pytest
 
+from hvt_codecs.passthrough import sources
+from hvt_codecs.passthrough.camera import Passthrough
+from hvt_codecs.passthrough.sources import CodedStreamGrabber
 from hvt_common.errors import NotYetError, UserError
-from hvt_edge.source import coded, stream
-from hvt_edge.source.coded import CodedStreamGrabber
+from hvt_edge.source import stream
 from hvt_edge.source.live import SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.stream import StreamGrabber
@@ -43,7 +45,7 @@ def film_that_stops(*, pictures: int = 10, tones: int = 200, **options: str) -> 
 def quarters(monkeypatch):
     """Each look at the clock takes a quarter of a second."""
     seconds = itertools.count()
-    for module in (stream, coded):
+    for module in (stream, sources):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
 
 
@@ -117,9 +119,9 @@ def test_a_camera_that_sends_no_keyframe_is_opened_again(monkeypatch, grabber, c
     stops(grabber, "tcp://camera", "does a keyframe come")
 
 
-@pytest.mark.parametrize("coded", [False, True])
+@pytest.mark.parametrize("opens", [open_source, Passthrough.open_source])
 @pytest.mark.parametrize(("fps", "waits_s"), [(15, 2), (0.3, 20 / 3), (0.01, 10)])
-def test_a_camera_that_is_as_slow_as_was_asked_is_not_gone(monkeypatch, fps, waits_s, coded):
+def test_a_camera_that_is_as_slow_as_was_asked_is_not_gone(monkeypatch, fps, waits_s, opens):
     """One that gives a picture each three seconds would be opened again and again, and show nothing."""
     waited = []
 
@@ -129,7 +131,7 @@ def test_a_camera_that_is_as_slow_as_was_asked_is_not_gone(monkeypatch, fps, wai
 
     monkeypatch.setattr(av, "open", away)
     with pytest.raises(NotYetError):
-        open_source("tcp://camera:554", size=(320, 180), fps=fps, coded=coded)
+        opens("tcp://camera:554", size=(320, 180), fps=fps)
     assert waited == [pytest.approx(waits_s)]
 
 

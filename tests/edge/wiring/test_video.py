@@ -4,13 +4,14 @@ from pathlib import Path
 
 import pytest
 
+from hvt_codecs.passthrough.camera import Passthrough
 from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig, check, check_rate, with_profile
 from hvt_edge.source.opening import open_source
 from hvt_edge.stills.policy.m6 import ExpectedGain
-from hvt_edge.wiring import as_the_camera_is, base_size, default_size
+from hvt_edge.wiring import base_size, default_size, surveyed
 from hvt_edge.wiring.link import auto_settings
 from hvt_edge.wiring.perception import make_method
 from media.hevc_camera import SIZE, write_clip
@@ -65,16 +66,19 @@ def test_a_size_that_is_given_holds_and_another_fits_the_budget(flags, source, s
         check_rate(config, size)
 
 
-@pytest.mark.parametrize(("coded", "says"), [(True, "--fps is 5"), (False, "no video that is coded already")])
-def test_no_refusal_says_the_cameras_password(tmp_path: Path, coded, says):
+@pytest.mark.parametrize(
+    ("opens", "says"),
+    [(Passthrough.open_source, "--fps is 5"), (open_source, "no video that is coded already")],
+)
+def test_no_refusal_says_the_cameras_password(tmp_path: Path, opens, says):
     """It would stand in a log that everybody reads."""
     config = EdgeConfig(source="rtsp://admin:SECRET@10.0.0.5/s", encoder="passthrough", fps=5.0)
     clip = write_clip(tmp_path / "a.mp4")
     with (
-        open_source(str(clip), size=SIZE, fps=15, coded=coded) as source,
+        opens(str(clip), size=SIZE, fps=15) as source,
         pytest.raises(UserError, match=says) as caught,
     ):
-        as_the_camera_is(config, source)
+        surveyed(config, source)
     assert "SECRET" not in str(caught.value)
     assert "10.0.0.5" in str(caught.value)
 

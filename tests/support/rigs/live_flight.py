@@ -11,10 +11,13 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
 
+from hvt_codecs.passthrough.camera import Camera, Passthrough
+from hvt_codecs.passthrough.stream import CameraStream, SeenUnit
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
@@ -27,14 +30,18 @@ from hvt_edge.config import EdgeConfig, check, check_rate
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.realtime import LinkControl
 from hvt_edge.operating import Keyframes, KeyframeSettings, Rates
-from hvt_edge.source.contract import CameraStream, SeenUnit
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
-from hvt_edge.video.encoder import Encoder, encoder_settings, keyframe_floor_bytes, minimum_bps
-from hvt_edge.video.passthrough import Passthrough, PassthroughStage
+from hvt_edge.video.encoder import (
+    Encoder,
+    EncoderSettings,
+    encoder_settings,
+    keyframe_floor_bytes,
+    minimum_bps,
+)
 from hvt_edge.video.stage import Action
-from hvt_edge.wiring.link import make_budget, make_camera_rates, make_least_link, make_pacer
+from hvt_edge.wiring.link import make_budget, make_pacer
 from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, make_frame_skip
 from rigs.kept import INFO
 from rigs.messages import feedback
@@ -191,13 +198,14 @@ class LiveFlight:
         """Seconds at which an encoder was opened."""
         self._left: list[tuple[float, float, int]] = []
         """(second at which a message was sent, second at which it had left, its bytes)."""
-        self.stream = None
+        self.surveyed = None
         if camera:
             fps = config.nominal_fps
             seen = (SeenUnit(n / fps, len(one.data), one.keyframe) for n, one in enumerate(surveyed))
-            self.stream = CameraStream(tuple(seen), fps)
+            source: Any = SimpleNamespace(camera_stream=CameraStream(tuple(seen), fps))
+            self.surveyed = Camera(config, source)
             keyframe_s = 0
-        every_s = None if self.stream is None else self.stream.keyframe_s
+        every_s = None if self.surveyed is None else self.surveyed.keyframe_s
         self.keyframes = Keyframes(
             KeyframeSettings(interval_ns=round(keyframe_s * SECOND_NS), camera_every_s=every_s)
         )
@@ -210,7 +218,7 @@ class LiveFlight:
         config = self.config
         decimation = 1 if self.camera else first_decimation(config, size)
         self.operating = make_operating(config, decimation=decimation)
-        self.pacer = make_pacer(config, self.stream, size)
+        self.pacer = make_pacer(config, self.surveyed, size)
         outbox = Outbox()
         self.failures = Failures(self._clock)
         self.transmitter = make_transmitter(
@@ -254,14 +262,13 @@ class LiveFlight:
             failures=self.failures,
         )
         self.stage: Any
-        if self.stream is not None:
-            self.stage = PassthroughStage(
-                Passthrough(),
+        if self.surveyed is not None:
+            self.stage = self.surveyed.make_stage(
+                Passthrough(EncoderSettings(size, fps=config.nominal_fps, bitrate_bps=1)),
+                reconfiguration,
                 keyframes=self.keyframes,
                 transmitter=self.transmitter,
                 failures=self.failures,
-                rates=make_camera_rates(config, self.stream, reconfiguration),
-                least_link=make_least_link(config, self.transmitter),
                 admits=self.link_control.admits,
                 pause=self._pause,
             )

@@ -185,7 +185,6 @@ class PassedOn(Source):
     def __init__(self, inner: Source, *, before: Callable[[Frame], bool | None]) -> None:
         self._inner, self._before = inner, before
         self.view, self.fps, self.frame_count = inner.view, inner.fps, inner.frame_count
-        self.camera_stream = inner.camera_stream
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         for frame in self._inner.frames(start_ns=start_ns):

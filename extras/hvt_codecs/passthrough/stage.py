@@ -14,34 +14,22 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 
+from hvt_codecs.passthrough.stream import CameraStream
 from hvt_common.errors import UserError
 from hvt_common.protocol.edge_words import FrameGroup
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import State
 from hvt_edge.link.budget import BASE_PEAK
-from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.qualification import Allowed, Measured, line_bytes
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import Action, BaseStage, FrameDecision, FrameInputs, decide
-from hvt_edge.video.x265 import Region
 
 _LONG_KEYFRAMES_S = 4.0
 """Longest keyframe interval without a note at the start: a ground that joins, or has lost frames, waits for it."""
-
-
-class Passthrough:
-    """An `Encoder` that encodes nothing. The camera decides on keyframes, whatever is requested."""
-
-    mean_qp = math.nan
-
-    def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
-        del keyframe
-        assert not regions, "config.check() refuses regions with another encoder than x265"
-        return unit_of(frame)
 
 
 def unit_of(frame: Frame) -> AccessUnit:

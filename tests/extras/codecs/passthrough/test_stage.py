@@ -10,6 +10,18 @@ import av
 import pytest
 
 from hvt_archive.local_copy import LocalCopy
+from hvt_codecs.passthrough.camera import Passthrough
+from hvt_codecs.passthrough.sources import CodedVideoSource
+from hvt_codecs.passthrough.stage import (
+    FullestWindow,
+    LeastLink,
+    PassthroughStage,
+    about_keyframes,
+    check_camera,
+    measure_camera,
+    needed_bps,
+)
+from hvt_codecs.passthrough.stream import CameraStream, SeenUnit
 from hvt_common.errors import UserError
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Failures
@@ -18,23 +30,14 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.operating import Keyframes, KeyframeSettings, base_rate_bps
-from hvt_edge.source.contract import CameraStream, SeenUnit
-from hvt_edge.source.opening import open_source
-from hvt_edge.video.passthrough import (
-    FullestWindow,
-    LeastLink,
-    Passthrough,
-    PassthroughStage,
-    about_keyframes,
-    check_camera,
-    measure_camera,
-    needed_bps,
-)
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.qualification import allowed, line_bytes
 from media.clips import START_NS, hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, write_clip
 from rigs import keeping
 from rigs.world import Puts, make_transmitter
+
+CODES_NOTHING = Passthrough(EncoderSettings(SIZE, fps=15, bitrate_bps=800_000))
 
 
 class Rig:
@@ -45,7 +48,7 @@ class Rig:
         self.now_ns = START_NS
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=2.0))
         self.stage = PassthroughStage(
-            Passthrough(),
+            CODES_NOTHING,
             keyframes=self.keyframes,
             transmitter=make_transmitter(
                 self.kept,
@@ -81,7 +84,7 @@ class Rig:
 def frames_of(folder: Path, pictures, **settings):
     """A camera's frames, and its stream."""
     clip = write_clip(folder / "camera.mp4", pictures, **settings)
-    with open_source(str(clip), size=SIZE, fps=15, coded=True) as source:
+    with Passthrough.open_source(str(clip), size=SIZE, fps=15) as source:
         return list(source.frames(start_ns=START_NS))
 
 
@@ -248,7 +251,7 @@ def test_an_outage_is_stored_from_keyframe_to_keyframe(tmp_path):
     frames = frames_of(tmp_path, smooth_pictures(90, size=SIZE), keyint=15)
     rig = keeping.Rig(tmp_path / "store")
     parts = {"keyframes": rig.keyframes, "transmitter": rig.sender, "failures": rig.failures}
-    rig.stage = PassthroughStage(Passthrough(), **parts, admits=rig.admits, backlog=rig.backlog)
+    rig.stage = PassthroughStage(CODES_NOTHING, **parts, admits=rig.admits, backlog=rig.backlog)
     for frame in frames:
         rig.now_ns, rig.linked = frame.capture_ns, not 35 <= frame.index < 62
         rig.link_control.before_frame(rig.now_ns)
@@ -290,7 +293,8 @@ def test_the_fullest_window_is_any_window_by_the_cameras_times():
 def test_a_camera_that_takes_too_much_is_refused_with_its_figure(tmp_path):
     """Most of its pictures would be left out, and nobody say why."""
     clip = write_clip(tmp_path / "a.mp4", hard_pictures(45, size=SIZE), more="qp=30")
-    with open_source(str(clip), size=SIZE, fps=15, coded=True) as source:
+    with Passthrough.open_source(str(clip), size=SIZE, fps=15) as source:
+        assert isinstance(source, CodedVideoSource)
         stream = source.camera_stream
     takes_bps = 8 * measure_camera(stream, **WHOLE).window_bytes
 

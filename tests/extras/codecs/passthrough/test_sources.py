@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvt_codecs.passthrough import sources as coded_source
+from hvt_codecs.passthrough.camera import Passthrough
+from hvt_codecs.passthrough.sources import CameraPacket, CodedLiveSource, CodedStreamGrabber
+from hvt_codecs.passthrough.stage import measure_camera
+from hvt_codecs.passthrough.stream import CameraDecoder, CameraUnits, SeenUnit, rate_of, without_jumps
 from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder, nal_kind, nal_units, parameter_sets
-from hvt_edge.source import coded as coded_source
-from hvt_edge.source.camera_stream import CameraDecoder, CameraUnits, rate_of, without_jumps
-from hvt_edge.source.coded import CodedLiveSource, CodedStreamGrabber
-from hvt_edge.source.contract import SeenUnit, SourceSettings
-from hvt_edge.source.live import CameraPacket, Shot, SignalLost
-from hvt_edge.source.opening import open_source
-from hvt_edge.video.passthrough import measure_camera
+from hvt_edge.source.contract import SourceSettings
+from hvt_edge.source.live import Shot, SignalLost
 from media.clips import hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip
 from media.numbered import copied
@@ -30,7 +30,7 @@ SETTINGS = SourceSettings(size=lambda size: size, fps=15)
 
 def coded(spec, *, size=None, **settings):
     """Open it as ``--encoder passthrough`` does."""
-    return open_source(str(spec), size=size or SETTINGS.size, fps=15, coded=True, **settings)
+    return Passthrough.open_source(str(spec), size=size or SETTINGS.size, fps=15, **settings)
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.hevc", "a.ts"])
@@ -100,6 +100,7 @@ def test_what_is_damaged_is_left_out_up_to_the_next_keyframe(tmp_path, caplog):
         ({}, (640, 360), r"is 320x192, --size is 640x360, and .* sends the camera's own size"),
         ("demo", None, "is the drawn demo, and --encoder passthrough takes a video file or a stream"),
         ("/dev/video0", None, "is a device, and --encoder passthrough takes a video file or a stream"),
+        ("/dev/" + "x" * 300, None, "is a device, and"),
         (".", None, "is a folder, and --encoder passthrough takes a video file or a stream"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from statistics import median
 from typing import Any
@@ -23,7 +23,7 @@ from hvt_common.video.hevc import (
     nal_units,
     without_filler,
 )
-from hvt_edge.source.contract import BaseSize, SeenUnit, check_shape
+from hvt_edge.source.contract import BaseSize, check_shape
 from hvt_edge.source.decoding.pictures import matrix_of, turn_of
 
 _HVCC_HEADER_BYTES = 22
@@ -117,6 +117,35 @@ def _split(packet: bytes, length_bytes: int) -> list[bytes]:
             raise ValueError("the lengths in a packet do not add up")
         nals.append(packet[begin:at])
     return nals
+
+
+@dataclass(frozen=True, slots=True)
+class SeenUnit:
+    """One access unit that was surveyed before the flight."""
+
+    at_s: float
+    """The camera's time stamp, from its first unit on."""
+    size_bytes: int
+    """Size with the parameter sets that are put before a keyframe."""
+    keyframe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CameraStream:
+    """The stream as measured before the flight: the first minutes of a file, some seconds of a camera."""
+
+    units: tuple[SeenUnit, ...]
+    """The first is a keyframe."""
+    fps: float
+    """The frame rate by its time stamps."""
+
+    @property
+    def keyframe_s(self) -> float:
+        """The longest time from one keyframe to the next; without a second one, the time surveyed."""
+        times = [unit.at_s for unit in self.units if unit.keyframe]
+        return max(
+            (later - earlier for earlier, later in pairwise([*times, self.units[-1].at_s])), default=0.0
+        )
 
 
 REENCODE = "re-encode it with --encoder x265"

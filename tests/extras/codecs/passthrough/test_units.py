@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hvt_codecs.passthrough.stream import CameraUnits
 from hvt_common.video.hevc import LONG_START, PARAMETER_SETS, BaseDecoder, nal_kind, nal_units, parameter_sets
-from hvt_edge.source.camera_stream import CameraUnits
 from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip
 
 

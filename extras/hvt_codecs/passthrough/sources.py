@@ -16,33 +16,27 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from hvt_common.errors import FlightError, NotYetError, UserError
-from hvt_common.runtime.failures import Failures
-from hvt_common.units import SECOND_NS, exact_rate
-from hvt_common.values import Frame, Image
-from hvt_edge.source.camera_stream import (
+from hvt_codecs.passthrough.stream import (
     LONG_STEP_S,
     REENCODE,
     CameraDecoder,
+    CameraStream,
     CameraUnits,
+    SeenUnit,
     check_picture,
     check_stream,
     open_units,
     rate_of,
     without_jumps,
 )
-from hvt_edge.source.contract import (
-    IDLE_S,
-    BaseSize,
-    CameraStream,
-    ClipSource,
-    Notes,
-    SeenUnit,
-    SourceSettings,
-)
+from hvt_common.errors import FlightError, NotYetError, UserError
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS, exact_rate
+from hvt_common.values import Frame, Image
+from hvt_edge.source.contract import IDLE_S, BaseSize, ClipSource, Notes, SourceSettings
 from hvt_edge.source.decoding.container import about_times, name_of, open_video, packets_of, survey
 from hvt_edge.source.decoding.timeline import Stamps
-from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
+from hvt_edge.source.live import SOURCE_PART, Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.resample import Resizer
 from hvt_edge.source.stream import (
     FIRST_S,
@@ -58,6 +52,16 @@ _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 MOST_OTHER_NS = 10 * SECOND_NS
 """A camera that sends pictures of another size or format for longer does not return to those of the start."""
 QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPacket:
+    """A frame as coded by the camera; packets of one decoder come in order, and it needs each of them."""
+
+    data: bytes
+    at_s: float | None
+    """The stream's own time stamps; None without any."""
+    decoder: CameraDecoder
 
 
 class CodedStreamGrabber(StreamGrabber):
@@ -171,7 +175,8 @@ class CodedLiveSource(LiveSource):
         self._failures.works(SOURCE_PART)
         self._skips, self._other_since_ns = False, None
         unit, picture = decoded
-        return self._resizer.coded_frame(picture.bgr(), unit, index=index, capture_ns=item.capture_ns)
+        frame = self._resizer.frame(picture.bgr(), index=index, capture_ns=item.capture_ns)
+        return replace(frame, camera_unit=unit)
 
     def _check_other(self, decoder: CameraDecoder, now_ns: int) -> None:
         # A new start accepts the size and format that the camera sends now.
@@ -192,7 +197,7 @@ class CodedLiveSource(LiveSource):
 
     def _take(self, shot: Shot, capture_ns: int, *, jitter_ns: int) -> None:  # noqa: ARG002 - each has its place
         packet = shot.packet
-        assert packet is not None, "a CodedStreamGrabber gives no other"
+        assert isinstance(packet, CameraPacket), "a CodedStreamGrabber gives no other"
         with self._news:
             self._number += 1
             self._queue.append(_Queued(self._number, capture_ns, packet))
@@ -213,7 +218,7 @@ class CodedLiveSource(LiveSource):
             if surveyed_s > _LEAST_SURVEY_S and sum(unit.keyframe for unit in seen) > 1:
                 break
             packet = grabber.grab().packet
-            assert packet is not None, "a CodedStreamGrabber gives no other"
+            assert isinstance(packet, CameraPacket), "a CodedStreamGrabber gives no other"
             decoded = packet.decoder.decode(packet.data)
             if decoded is None:
                 trouble = packet.decoder.trouble or trouble
@@ -302,9 +307,9 @@ class CodedVideoSource(ClipSource):
                 unit, picture = decoded
                 # Two pictures with one time would count as one at the ground.
                 last_ns = max(last_ns + 1, round((at_s - zero_s) * SECOND_NS))
-                yield self._resizer.coded_frame(
-                    picture.bgr(), unit, index=count + left_out - before, capture_ns=start_ns + last_ns
-                )
+                index, capture_ns = count + left_out - before, start_ns + last_ns
+                frame = self._resizer.frame(picture.bgr(), index=index, capture_ns=capture_ns)
+                yield replace(frame, camera_unit=unit)
                 count += 1
         if left_out:
             why = f" ({decoder.trouble})" if decoder.trouble else ""
