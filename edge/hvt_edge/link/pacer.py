@@ -394,9 +394,14 @@ class Pacer:
         True where the link has just come back, or messages in flight seem lost: the video needs a keyframe to go on.
         """
         with self._lock:
-            before, self._linked, self._reports = self._linked, there, reports
+            before, reported = self._linked, self._linked and self._reports
+            self._linked, self._reports = there, reports
             if there and not before:
                 self._started_ns, self._progress_ns = None, now_ns
+            if there and reports and not reported:
+                self._controller.begin()
+            elif self._started_ns is not None and now_ns - self._started_ns >= _FORGET_NS:
+                self._controller.trust()
             if before and not there:
                 self._flight.clear()
                 if self._reported_ns is not None:

@@ -54,6 +54,10 @@ _PLATEAU_NS = 2_600 * _MS
 """Time of the growth back to the rate of the last breakdown."""
 _BEYOND_PER_S3 = 0.008
 """Growth beyond it, as a share of that rate, by the third power of the seconds."""
+_BEGIN_SHARE = 8
+"""A flight begins at this part of the ceiling: a thin link has carried its first second in two."""
+_SUSTAINED = 0.9
+"""Messages that came no more slowly than this part of the pace at which they were sent found no queue."""
 _RESUME_NS = 3 * SECOND_NS
 """Time of the growth back to the former rate after the link was gone."""
 _MOST_LOSS = 0.12
@@ -247,18 +251,30 @@ class RateController:
         elif excess_ns < limit_ns // 2:
             self._grow(step_ns // 2 if self._losses.share > _SOME_LOSS else step_ns)
 
+    def begin(self) -> None:
+        """Nothing is known of the link: the rate begins low, and nears the former one as fast as messages come."""
+        self._climb_from(min(self._rate, max(self._floor_bps, self._ceiling_bps / _BEGIN_SHARE)))
+
+    def trust(self) -> None:
+        """Nobody has reported anything, ever, and nobody will: the rate is the ceiling."""
+        if self._last_ns is None:
+            self._rate = float(self._ceiling_bps)
+
     def on_silence(self, now_ns: int) -> None:
         """Reports have stopped: the rate falls to the floor. When they return it nears the former rate quickly."""
         if not self._silent:
             self._silent = True
             if self._curve_ns >= self._plateau_ns:  # else it is still on its way back
                 self._cubic_max = self._rate
-            self._rate = self._low = float(self._floor_bps)
-            self._curve_ns, self._plateau_ns = 0, _RESUME_NS
+            self._climb_from(self._floor_bps)
             self.backoffs += 1
             self._losses.clear()  # losses while a link is away are no property of it
             self._start_over(now_ns)
         self._last_ns = now_ns
+
+    def _climb_from(self, rate: float) -> None:
+        self._rate = self._low = float(rate)
+        self._curve_ns, self._plateau_ns = 0, _RESUME_NS
 
     def forget_path(self) -> None:
         """The receiver or the transport has changed: earlier delays say nothing."""
@@ -352,7 +368,7 @@ class RateController:
         wanted = self._on_curve(curve_ns)
         # The rate stays near the measured arrival rate: where little is sent, it does not run away. After a silence
         # little is sent, however good the link: on the way back one message that came quickly is enough.
-        proven = max(2 * self._lately_bps(), min(self._cubic_max, self._delivery_bps()))
+        proven = max(self._lately_proven_bps(), min(self._cubic_max, self._delivery_bps()))
         if wanted <= proven:
             self._curve_ns = curve_ns
         self._rate = min(float(self._ceiling_bps), max(self._rate, min(wanted, proven)))
@@ -369,15 +385,20 @@ class RateController:
         last_ns = self._recent[-1][0].arrived_ns
         return max(one.delivery_bps for one, _ in self._recent if last_ns - one.arrived_ns <= SECOND_NS)
 
-    def _lately_bps(self) -> float:
-        # The arrival rate of about the last second; half the rate if it is not known yet.
+    def _lately_proven_bps(self) -> float:
+        # A multiple of the arrival rate of about the last second; the present rate if that is not known yet.
         last = first = self._recent[-1][0]
         for first, _ in reversed(self._recent):
             if last.arrived_ns - first.arrived_ns >= SECOND_NS:
                 break
-        if last.arrived_ns - first.arrived_ns < SECOND_NS // 2:
-            return self._rate / 2
-        return _arrival_bps(first, last)
+        span_ns = last.arrived_ns - first.arrived_ns
+        if span_ns < SECOND_NS // 2:
+            return self._rate
+        if self._plateau_ns != _RESUME_NS or self._curve_ns >= self._plateau_ns:
+            return 2 * _arrival_bps(first, last)
+        # On the way up the least delay may itself be that of a queue, and show no excess.
+        sustained = last.sent_ns - first.sent_ns >= _SUSTAINED * span_ns
+        return (3 if sustained else 1) * _arrival_bps(first, last)
 
 
 def _arrival_bps(first: Progress, last: Progress) -> float:

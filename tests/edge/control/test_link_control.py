@@ -79,7 +79,7 @@ def test_a_forged_number_of_a_still_in_a_report_takes_none_for_received(rig):
     assert rig.outbox.unacknowledged == 0
 
 
-@pytest.mark.parametrize("rig", [{"adapt": True}], indirect=True)
+@pytest.mark.parametrize("rig", [{"adapt": True, "budget": (800_000, 650_000)}], indirect=True)
 def test_a_ground_that_hears_and_misses_video_is_said_and_stored_for(rig):
     """Beyond a hole for large packets the edge would send the flight in vain, at its full rate, and be content."""
     waits = replace(

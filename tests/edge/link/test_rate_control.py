@@ -46,34 +46,45 @@ def progress(sent_ns: int, arrived_bytes: float, *, delay_ns: int = 20 * MS, **c
 
 
 @pytest.mark.parametrize(
-    ("held", "more"),
+    ("found_s", "held", "more"),
     [
-        (0, {}),
-        (0, {"late_s": lambda second: 0.0 if second % 0.5 < 0.1 else None}),  # where little arrives
-        (10, {"way_s": lambda _second: 0.6}),  # of 450, while the round trip is not known yet
-        (0, {"ahead_s": lambda second: 10**6 + second * 50e-6}),
-        (0, {"ahead_s": lambda second: 0 if second < 10 else 3_600}),
-        (0, {"ahead_s": lambda second: 0 if second < 10 else -3_600}),
+        (3, 0, {}),
+        (3, 0, {"method": "M5", "video_share": 0.6}),  # where little is sent: there are no stills
+        (4, 0, {"late_s": lambda second: 0.0 if second % 0.5 < 0.1 else None}),  # where little arrives
+        (6, 10, {"way_s": lambda _second: 0.6}),  # of 450, while the round trip is not known yet
+        (3, 0, {"ahead_s": lambda second: 10**6 + second * 50e-6}),
+        (3, 0, {"ahead_s": lambda second: 0 if second < 10 else 3_600}),
+        (3, 0, {"ahead_s": lambda second: 0 if second < 10 else -3_600}),
     ],
-    ids=["near", "few reports", "satellite", "clock drift", "clock set ahead", "clock set back"],
+    ids=["near", "quiet", "few reports", "satellite", "clock drift", "clock set ahead", "clock set back"],
 )
-def test_a_steady_link_above_the_budget_is_never_left_below_the_ceiling(held, more):
+def test_a_steady_link_above_the_budget_is_found_within_seconds_and_kept(found_s, held, more):
     """On a link that carries the budget the picture would be worse than paid for, or freeze as a clock is set."""
     flight = flown(30, (0, 1e6), **more)
-    assert (min(flight.rate_between(0, 30)), flight.opened) == (800_000, [0])
+    assert min(flight.rate_between(found_s, 30)) > 0.85 * 800_000
+    assert set(flight.rate_between(found_s + 3, 30)) == {800_000}
+    assert len(flight.opened) <= 8
     assert flight.held <= held
+
+
+@pytest.mark.parametrize("kbps", [60, 150, 300])
+def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps):
+    """A pilot with a thin radio who forgot ``--budget`` would see the picture of ten seconds ago, or none at all."""
+    flight = flown(40, (0, 1e3 * kbps), size=(1280, 720), way_s=lambda _second: 0.3)
+    assert max(flight.delays_between(0, 40)) < 2.5
+    assert flight.longest_hole(0, 40) < 2
 
 
 def test_a_fall_to_a_fifth_and_back():
     """Behind a hill the picture would be seconds old; past it, it would stay as coarse as behind it."""
     flight = flown(60, (0, 1e6), (15, 2e5), (35, 1e6))
-    assert max(flight.delays_between(15, 18)) > 1
+    assert max(flight.delays_between(15, 18)) > 0.9
     assert max(flight.delays_between(18, 60)) < 0.6
     assert flight.carried_bps(20, 35) > 0.8 * 200_000
     before = flight.carried_bps(5, 15)
     assert min(flight.carried_bps(t, t + 2) for t in range(48, 58, 2)) > 0.9 * before
     assert flight.rates[-1][1] == 800_000
-    assert len(flight.opened) <= 13
+    assert len(flight.opened) <= 17
 
 
 def test_cross_traffic_is_given_way_and_taken_back():
@@ -86,7 +97,7 @@ def test_cross_traffic_is_given_way_and_taken_back():
 
 def test_loss_without_a_queue_lowers_the_rate_where_it_is_heavy():
     """A radio that loses one packet in twenty would be taken for a full one, or a policer be flooded for ever."""
-    assert min(flown(40, (0, 1e6), loss=0.05).rate_between(0, 40)) > 600_000
+    assert min(flown(40, (0, 1e6), loss=0.05).rate_between(3, 40)) > 600_000
     heavy = flown(40, (0, 1e6), loss=0.3)
     assert heavy.rates[-1][1] < 600_000
     assert heavy.pacer.backoffs >= 2
@@ -161,7 +172,7 @@ def test_a_link_below_the_budget_is_filled_without_oscillation():
     flight = flown(60, (0, 2e5))
     rates = flight.rate_between(20, 60)
     assert min(rates) > 150_000
-    assert max(rates) < 310_000
+    assert max(rates) < 370_000
     assert flight.carried_bps(20, 60) > 0.82 * 200_000
     assert max(flight.delays_between(20, 60)) < 0.6
     assert len([second for second in flight.opened if second > 20]) <= 12
@@ -187,7 +198,7 @@ def test_what_was_never_sent_proves_nothing():
     steered.on_silence(0)
     for number in range(1, 200):
         steered.on_progress(progress(number * 150 * MS - 40 * MS, number * 1_500, serialization_ns=5 * MS))
-    assert 150_000 < steered.rate_bps <= 200_000  # 80 kbps arrive
+    assert 150_000 < steered.rate_bps <= 250_000  # 80 kbps arrive
 
 
 @pytest.mark.parametrize("way_s", [0.32, 1.02])
@@ -386,6 +397,17 @@ def test_the_start_waits_for_the_first_report():
     assert admitted == [*range(10), *range(40, 75)]
     pacer.on_report(counted(feedback(base_sequence=10), now_ns=5 * S, first=True))
     assert pacer.ignored == 0
+
+
+def test_a_ground_that_never_reports_gets_the_whole_budget_in_the_end():
+    """Behind keys that let no report through the picture would stay as coarse as in the first second."""
+    pacer, rates = Pacer(controller()), []
+    pacer.link(True, reports=False, now_ns=0)  # its subscriptions come one after the other
+    for second in range(20):
+        pacer.link(True, now_ns=second * S)
+        rates.append(pacer.rate_bps)
+        pacer.sent_base(second, 5_000, now_ns=second * S, keyframe=True)
+    assert rates == [100_000] * 15 + [800_000] * 5
 
 
 def test_a_receiver_that_has_left_is_forgotten_and_the_rate_stays_at_its_least():
