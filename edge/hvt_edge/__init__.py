@@ -3,20 +3,13 @@
 A program that has frames of its own uses `open`, see docs/library.md.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from hvt_edge.library import open_edge as open  # noqa: A004 - of this package it is the first thing to do
-
-__all__ = ["open"]
+from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Load `open` only when it is used."""
+    """Load `open`, of an extra, only when it is used."""
     if name == "open":
-        from hvt_edge.library import open_edge  # noqa: PLC0415
+        from hvt_common.runtime.plug_ins import library_part  # noqa: PLC0415
 
-        return open_edge
+        return library_part("edge", name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,20 +3,13 @@
 A program that wants the pictures, tracks and stills itself uses `listen`, see docs/library.md.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from hvt_ground.library import listen
-
-__all__ = ["listen"]
+from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Only who uses it loads it."""
+    """Load `listen`, of an extra, only when it is used."""
     if name == "listen":
-        from hvt_ground.library import listen  # noqa: PLC0415
+        from hvt_common.runtime.plug_ins import library_part  # noqa: PLC0415
 
-        return listen
+        return library_part("ground", name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -135,6 +135,8 @@ def test_an_encoder_of_hardware_without_its_extra_names_it(monkeypatch):
     assert {"hevc_nvenc", "passthrough"} < {*brought}
     monkeypatch.setattr("hvt_edge.video.encoder.installed", lambda _group: {})
     monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
+    with pytest.raises(UserError, match=r"^hvt_edge.open is of an extra .*: pip install 'hvt\[edge\]'$"):
+        assert hvt_edge.open(budget="300kbps")
     for name in brought:
         says = rf"^--encoder {name} is of an extra that is not installed: pip install 'hvt\[edge\]'$"
         with pytest.raises(UserError, match=says):

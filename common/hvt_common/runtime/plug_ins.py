@@ -56,6 +56,14 @@ def origin(entry: EntryPoint) -> str:
     return f"package {entry.dist.name} ({entry.value})" if entry.dist is not None else entry.value
 
 
+def library_part(side: str, name: str) -> Any:
+    """The function of that name with which another program runs a side; `UserError` without its extra."""
+    entry = the_one("hvt.library", side, what="library", built_in=False)
+    if entry is None:
+        raise UserError(f"hvt_{side}.{name} is of an extra that is not installed: pip install 'hvt[{side}]'")
+    return loaded(entry, lambda found: found, what="library")
+
+
 _GROUP = "hvt.health"
 
 

@@ -26,9 +26,6 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LITTLE, _NICENESS = 5, 11
 """x265 sets its own workers to 10 (threadpool.cpp); far below them a network stands still beside other programs."""
 _SWITCH_S = 0.0005
-_ZENOH_CALLBACK = "(pyo3-closure)"
-"""Zenoh's Python package runs each callback in a thread of such a name, and joins none."""
-_JOIN_WITHIN_S = 30.0
 _CHECK_EVERY_S = 0.1
 _SECOND_SIGNAL_S = 1.0
 _END_WITHIN_S = 9.0
@@ -135,21 +132,6 @@ def leave(code: int) -> NoReturn:
 
 
 @functools.cache
-def join_threads_at_exit() -> None:
-    """Have the program wait, before Python finalizes, for the threads that this project and Zenoh have started.
-
-    For a program that is not ours and cannot end by `leave`. Those of a session end soon after it is closed.
-    """
-    atexit.register(_join_threads)
-
-
-def _join_threads() -> None:
-    until_s = time.monotonic() + _JOIN_WITHIN_S
-    for thread in threading.enumerate():
-        if thread.name.startswith(("hvt-", "zenoh-")) or thread.name.endswith(_ZENOH_CALLBACK):
-            thread.join(max(0.0, until_s - time.monotonic()))
-
-
 def lower_priority(*, little: bool = False) -> None:
     """Let other threads go before the calling one, and before those that it starts; on Linux only.
 

@@ -14,11 +14,11 @@ import pytest
 import hvt_edge
 import hvt_ground
 from hvt_common.errors import FlightError, UserError
-from hvt_edge import library
-from hvt_edge.library import PushedEdge
 from hvt_edge.source import live
 from hvt_ground.events import Overlay
-from hvt_ground.library import Picture, Received, _Events
+from hvt_library import edge as library
+from hvt_library.edge import PushedEdge
+from hvt_library.ground import Picture, Received, _Events
 from media.recorded_feed import drawn_frames
 from programs.processes import eventually, free_ports
 
@@ -172,7 +172,7 @@ gc.callbacks.append(lambda *_: time.sleep(0.5))  # Python's end takes longer tha
 """
 
 
-@pytest.mark.parametrize("library", ["hvt_edge.library", "hvt_ground.library"])
+@pytest.mark.parametrize("library", ["hvt_library.edge", "hvt_library.ground"])
 def test_a_program_ends_while_zenoh_calls(library):
     """Python ends a thread that comes back from a callback as it finalizes, and Zenoh's library aborts."""
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
@@ -204,7 +204,7 @@ time.sleep(1)
 
 def test_large_pictures_that_nobody_takes_have_a_bound_in_bytes(monkeypatch):
     """32 pictures of 8192x4352 would be three gigabytes, of an edge that sent a few kilobytes."""
-    monkeypatch.setattr("hvt_ground.library.MOST_QUEUED_BYTES", 1000)
+    monkeypatch.setattr("hvt_library.ground.MOST_QUEUED_BYTES", 1000)
     events, large = _Events(), Picture(0, 0, np.zeros((10, 10, 3), np.uint8))
     for _ in range(4):
         events.put(Received("uav-1", 1, large), block=False)

@@ -6,7 +6,6 @@ taken yet.
 
 from __future__ import annotations
 
-import atexit
 import operator
 import threading
 from typing import Any, Self, cast
@@ -16,7 +15,6 @@ import numpy as np
 from hvt_common.config import load, settings_words
 from hvt_common.errors import UserError
 from hvt_common.runtime.failures import RetryPause
-from hvt_common.runtime.process import join_threads_at_exit
 from hvt_common.values import Fit, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
@@ -24,12 +22,11 @@ from hvt_edge.source.contract import Source, SourceSettings
 from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.wiring import base_size
 from hvt_edge.world import World
+from hvt_library.program import InThread
 
 _NAME = "pushed frames"
 PATIENCE_S = 5.0
 """A program that pushes nothing for this long is reported as away, as a camera is."""
-
-join_threads_at_exit()
 
 
 def open_edge(**settings: object) -> PushedEdge:
@@ -50,21 +47,20 @@ def open_edge(**settings: object) -> PushedEdge:
 class PushedEdge:
     """Sends pushed frames until it is closed; use it with ``with``. For any thread.
 
-    Attributes:
-        summary: The content of ``--summary``; empty before the end.
+    Its ``summary`` is the content of ``--summary``; empty before the end.
     """
 
     def __init__(self, config: EdgeConfig) -> None:
-        self.summary: dict[str, Any] = {}
         self._grabber = _PushGrabber()
         self._stop = threading.Event()
-        self._error: BaseException | None = None
         world = _PushedWorld(self._grabber)
         self._clock = world.clock
         self._edge = Edge(config, stop=self._stop, world=world)
-        self._thread = threading.Thread(target=self._run, name="hvt-edge", daemon=True)
-        self._thread.start()
-        atexit.register(self._stop_and_join)
+        self._flight = InThread(self._run, stop=self._cancel, name="hvt-edge")
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return self._flight.summary or {}
 
     def push(self, frame_bgr: Image, *, capture_ns: int | None = None) -> None:
         """Hand over a frame: (height, width, 3) uint8 BGR, copied. The first one sets the source's size.
@@ -84,16 +80,13 @@ class PushedEdge:
             raise ValueError(
                 f"a frame of {frame_bgr.dtype} {frame_bgr.shape} is not accepted: (height, width, 3) uint8 is"
             )
-        if self._error is not None:
-            raise self._error
+        self._flight.raise_error()
         self._grabber.put(frame_bgr.copy(), taken_ns)
 
     def close(self) -> None:
         """Send the rest, say goodbye, and wait for the end; raises the error that ended the edge before."""
-        self._stop_and_join()
-        atexit.unregister(self._stop_and_join)
-        if self._error is not None:
-            raise self._error
+        self._flight.end()
+        self._flight.raise_error()
 
     def __enter__(self) -> Self:
         return self
@@ -105,18 +98,15 @@ class PushedEdge:
             if kind is None:  # else the program's own error goes first
                 raise
 
-    def _stop_and_join(self) -> None:
+    def _cancel(self) -> None:
         self._stop.set()
         self._grabber.cancel_opening()
-        self._thread.join()
 
-    def _run(self) -> None:
+    def _run(self) -> dict[str, Any]:
         try:
-            self.summary = self._edge.run()
+            return self._edge.run()
         except _NothingPushed:
-            pass
-        except BaseException as error:  # noqa: BLE001 - handed to the program
-            self._error, self.summary = error, getattr(error, "summary", None) or {}
+            return {}
 
 
 def _nanoseconds(capture_ns: int) -> int:

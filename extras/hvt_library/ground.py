@@ -6,7 +6,6 @@ holds nobody else; in lockstep the edge waits for it.
 
 from __future__ import annotations
 
-import atexit
 import queue
 import threading
 from collections.abc import Callable, Iterator
@@ -16,7 +15,6 @@ from typing import Any, Self
 
 from hvt_common.config import load, settings_words
 from hvt_common.protocol.messages import Info
-from hvt_common.runtime.process import join_threads_at_exit
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.app import Ground
@@ -24,6 +22,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
 from hvt_ground.extras import checked, config_class
 from hvt_ground.sinks import SinkWriter
+from hvt_library.program import InThread
 
 _MOST_QUEUED, MOST_QUEUED_BYTES = 32, 128 * 2**20
 """Events, of which each may be a picture, and their pixels."""
@@ -51,9 +50,6 @@ class Received:
     event: Picture | Overlay | PoseUpdate | Refinement | Traffic | Notice
 
 
-join_threads_at_exit()
-
-
 def listen(**settings: object) -> Listening:
     """A ground with the settings of ``hvt-ground`` (docs/options.md), such as ``listen="tcp/0.0.0.0:7447"``.
 
@@ -68,19 +64,18 @@ def listen(**settings: object) -> Listening:
 class Listening:
     """Iterate over it: it ends when the ground does, with ``once`` after the edges, or when it is closed.
 
-    Attributes:
-        summaries: One a session, as ``--summary`` writes them; empty before the end.
+    Its ``summaries``, one a session, are as ``--summary`` writes them; empty before the end.
     """
 
     def __init__(self, config: GroundConfig) -> None:
-        self.summaries: list[dict[str, Any]] = []
         self._queue = _Events()
         self._stop = threading.Event()
-        self._error: BaseException | None = None
-        self._ground = Ground(config, stop=self._stop, program=self._sink_of)
-        self._thread = threading.Thread(target=self._run, name="hvt-ground", daemon=True)
-        self._thread.start()
-        atexit.register(self.close)
+        ground = Ground(config, stop=self._stop, program=self._sink_of)
+        self._flight = InThread(ground.run, stop=self._stop.set, name="hvt-ground")
+
+    @property
+    def summaries(self) -> list[dict[str, Any]]:
+        return self._flight.summary or []
 
     def __iter__(self) -> Iterator[Received]:
         return self
@@ -88,21 +83,18 @@ class Listening:
     def __next__(self) -> Received:
         """The next event; raises the error that ended the ground, `UserError` or `FlightError`."""
         while True:
-            running = self._thread.is_alive()
+            running = self._flight.thread.is_alive()
             try:
                 return self._queue.get(timeout=_POLL_S if running else 0.0)
             except queue.Empty:
                 if running:
                     continue
-            if self._error is not None:
-                raise self._error
+            self._flight.raise_error()
             raise StopIteration
 
     def close(self) -> None:
         """End the ground; events in the queue can still be taken."""
-        atexit.unregister(self.close)
-        self._stop.set()
-        self._thread.join()
+        self._flight.end()
 
     def __enter__(self) -> Self:
         return self
@@ -112,12 +104,6 @@ class Listening:
 
     def _sink_of(self, info: Info) -> Callable[[], _Queue]:
         return lambda: _Queue(self._queue, self._stop, info)
-
-    def _run(self) -> None:
-        try:
-            self.summaries = self._ground.run()
-        except BaseException as error:  # noqa: BLE001 - handed to the program
-            self._error, self.summaries = error, getattr(error, "summary", None) or []
 
 
 class _Events(queue.Queue[Received]):
