@@ -8,6 +8,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import cv2
+import numpy as np
 import pytest
 
 from hvt_common.config import load
@@ -21,13 +22,15 @@ from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, Missi
 from hvt_study.report.figures.drawing import plot, style_of
 from hvt_study.runs.methods import DDS, METHODS
 from hvt_study.runs.spec import ModelChoice
+from media.onnx_models import colour_detector
 from studies.layouts import write_mot
 
 FIRST_COLUMNS = [
     *("clip", "rate_kbps", "method", "half", "named_f1", "false_per_frame", "f1", "class_agreement"),
     *("total_bps", "base_bps", "roi_bps", "track_bps", "max_frame_bytes", "delay_p95_ms", "edge_cpu_ms"),
 ]
-CHEAP = ("--size", "640x360", "--max-frames", "30", "--jobs", "1")
+CARS = {"names": "{0: 'truck', 1: 'bus', 2: 'car'}"}
+CHEAP = ("--size", "320x180", "--max-frames", "30", "--jobs", "1")
 
 
 @pytest.mark.parametrize(
@@ -110,8 +113,13 @@ def test_runs_of_most_flights_go_first_and_say_nothing_of_the_time_of_others(tmp
 @pytest.mark.parametrize("methods", ["M5-jpeg", pytest.param("M0,M5-jpeg", marks=pytest.mark.nightly)])
 def test_a_comparison_end_to_end(tmp_path, capsys, methods):
     """The question that a user brings: what do I see at this budget?"""
-    cv2.imwrite(str(tmp_path / "scene.png"), cv2.resize(Scene(0).image(0.0), (720, 404)))
-    arguments = ["compare", f"still:{tmp_path / 'scene.png'}", "--detector", "aerial-nano"]
+    picture = np.random.default_rng(0).integers(0, 20, (404, 720, 3), np.uint8)
+    for number in range(8):
+        x, y = 60 + number % 4 * 160, 90 + number // 4 * 200
+        picture[y : y + 32, x : x + 32, 2] = 150 + 10 * number  # a network of colours sees red
+    cv2.imwrite(str(tmp_path / "scene.png"), picture)
+    network = colour_detector(tmp_path / "red.onnx", "yolox", size=(320, 180), metadata=CARS)
+    arguments = ["compare", f"still:{tmp_path / 'scene.png'}", "--detector", str(network)]
     arguments += ["--rates", "300", "--methods", methods]
     assert main([*arguments, "--out", str(tmp_path), *CHEAP]) == 0
     rows = json.loads((tmp_path / "compare.json").read_text())

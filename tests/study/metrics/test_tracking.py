@@ -64,13 +64,13 @@ def test_identities_are_those_of_motmetrics(seed):
 
 def test_a_study_of_many_tracks_is_scored_in_little_memory():
     """10,000 tracks took 4 GB in matrices of all tracks, true and shown, by all of them."""
-    sides = [np.array([k]) for k in range(3000)]
-    there, beside = np.array([square(0)]), np.array([square(50)])
-    frames = [((one, there), (one, beside if one % 2 else there)) for one in sides]
+    there, beside = (np.array([square(200 * k + off) for k in range(10)]) for off in (0, 50))
+    ids = np.arange(1500).reshape(150, 10)
+    frames = [((ten, there), (ten, (there, beside)[k % 2])) for k, ten in enumerate(ids)]
     tracemalloc.start()
     try:
-        assert compare_tracks(frames).id_true_positives == 1500
-        assert tracemalloc.get_traced_memory()[1] < 40e6
+        assert compare_tracks(frames).id_true_positives == 750
+        assert tracemalloc.get_traced_memory()[1] < 10e6
     finally:
         tracemalloc.stop()
 

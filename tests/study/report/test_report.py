@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from matplotlib.figure import Figure
 
 from hvt_common.errors import UserError
 from hvt_study import cli
@@ -37,6 +38,7 @@ from hvt_study.report.example.choice import (
     save_example,
 )
 from hvt_study.report.example.fly_again import example_of
+from hvt_study.report.figures.curve_figures import utility_figure
 from hvt_study.report.make import make_report
 from hvt_study.report.write import html_page, write_report
 from hvt_study.runs.run_context import RunContext
@@ -392,12 +394,16 @@ def test_the_page_has_all_that_the_paper_has(written):
     assert "<i>& \\| https" in markdown  # a bar within a cell parts no cells
 
 
-def test_the_same_table_makes_the_same_report(written):
+def test_the_same_table_makes_the_same_report(written, savefig, monkeypatch):
     """A report under version control must not change when nothing did."""
-    names = ("report.html", "report.md", "figures/utility-1.svg", "figures/utility-1.pdf")
+    names = ("report.html", "report.md", "figures/utility-1.svg")
     before = [(written / name).read_bytes() for name in names]
     write_report(written)
     assert [(written / name).read_bytes() for name in names] == before
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    one, other = (utility_figure(settings(study())[0], name="u").pdf for _ in range(2))
+    assert one == other
+    assert b"/Type3" not in one, "printers refuse fonts of that type"
 
 
 def test_a_study_of_one_method_or_none_that_counts_has_a_report():
