@@ -30,8 +30,7 @@ from hvt_edge.loop.realtime import RealtimePace, wait_for_ground
 from hvt_edge.operating import LoopClock
 from hvt_edge.report.state import Heartbeat, lacks
 from hvt_edge.report.status import status_text, summary
-from hvt_edge.source.contract import Source
-from hvt_edge.source.demo import check_truth
+from hvt_edge.source.contract import DrawnSource, Source
 from hvt_edge.source.live import SOURCE_PART
 from hvt_edge.wiring import (
     Flight,
@@ -107,7 +106,10 @@ class Edge:
                 stack.callback(pose_source.close)
                 for note in pose_source.notes:
                     logging.getLogger(START_LOGGER).info("pose: %s", note)
-            check_truth(config.truth, source)
+            if config.truth is not None and not isinstance(source, DrawnSource):
+                raise UserError(
+                    f"--truth {config.truth} is for --source demo: no other source knows its truth"
+                )
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
             say_size(config, source.view)

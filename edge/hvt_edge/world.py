@@ -17,7 +17,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink, ZenohLink
 from hvt_edge.loop.pose import PoseSource, PoseTable, open_pose
-from hvt_edge.source.demo import DemoSource
+from hvt_edge.source.contract import DrawnSource
 from hvt_edge.source.opening import Source, open_source, shown
 from hvt_edge.wiring import base_size, make_detector, make_link_settings, passthrough, warm_up_for
 
@@ -63,7 +63,7 @@ class World:
         if config.pose is None:
             return None
         if config.pose == "demo":
-            if not isinstance(source, DemoSource):
+            if not isinstance(source, DrawnSource):
                 raise UserError(
                     f"--pose demo is of the drawn scene, and --source is {shown(str(config.source))}"
                 )

@@ -10,12 +10,13 @@ from concurrent.futures import wait
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Self
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.log import START_LOGGER
 from hvt_common.runtime.process import in_thread
-from hvt_common.values import Fit, Frame, View
+from hvt_common.values import Fit, Frame, Pose, View
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or a function that gives it from the source's."""
@@ -82,6 +83,18 @@ class Source(ABC):
 
     def __exit__(self, *_error: object) -> None:
         self.close()
+
+
+class DrawnSource(Source):
+    """A scene that is drawn, and so knows its truth. Both are asked for before the first frame."""
+
+    @abstractmethod
+    def write_truth(self, path: Path, *, fps: float) -> None:
+        """Write the ground truth of a flight at that rate, in MOTChallenge form."""
+
+    @abstractmethod
+    def poses(self) -> list[Pose]:
+        """The camera's poses from the scene's beginning to its end."""
 
 
 class ClipSource(Source):

@@ -5,18 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from hvt_common.errors import FlightError, NotYetError, UserError, absent, named_path
 from hvt_common.redaction import HIDDEN, redacted
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.host_names import with_small_scheme
+from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
 from hvt_edge.source.contract import BaseSize, Source, SourceSettings, check_shape
 from hvt_edge.source.decoding.container import is_local
-from hvt_edge.source.demo import DemoSource, is_demo
 from hvt_edge.source.folder import FolderSource, is_tiff
 from hvt_edge.source.live import LiveSource, patience_s
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber, is_description
@@ -72,7 +72,7 @@ def open_source(
     )
     clock = clock or SteadyClock()
     if is_demo(spec):
-        return DemoSource(spec, settings, seed=seed)
+        return _drawn(spec, settings, seed=seed)
     if spec.startswith("~") and not is_there(spec):  # no shell replaces it in --source=~/clip.mp4
         spec = str(named_path(spec, name="source"))
     spec = spec if is_local(spec) else with_small_scheme(spec)
@@ -92,6 +92,18 @@ def open_source(
     if not scheme and (Path(spec).is_dir() or (is_tiff(spec) and kinds is _DECODED)):
         return FolderSource(spec, settings)
     return kinds.clip(spec, settings)
+
+
+def is_demo(spec: str) -> bool:
+    """Whether a source's name is the demo's, with or without words after a colon."""
+    return spec.partition(":")[0] == "demo"
+
+
+def _drawn(spec: str, settings: SourceSettings, *, seed: int) -> Source:
+    entry = the_one("hvt.scenes", "demo", what="scene", built_in=False)
+    if entry is None:
+        raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
+    return cast("Source", loaded(entry, lambda draw: draw(spec, settings, seed=seed), what="scene"))
 
 
 def _check_address(spec: str, scheme: str) -> None:

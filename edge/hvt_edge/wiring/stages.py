@@ -37,8 +37,7 @@ from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.report.state import Heartbeat
 from hvt_edge.report.status import InfoReporter, StatusReporter
-from hvt_edge.source.contract import Source
-from hvt_edge.source.demo import DemoSource
+from hvt_edge.source.contract import DrawnSource, Source
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Gate
@@ -288,7 +287,7 @@ class Stages:
         config, view = flight.config, flight.source.view
         self.link = link = Link(flight)
         # Files are made after all checks that may refuse the settings: a failed start leaves nothing behind.
-        if config.truth is not None and isinstance(flight.source, DemoSource):
+        if config.truth is not None and isinstance(flight.source, DrawnSource):
             flight.source.write_truth(config.truth, fps=config.nominal_fps)
         local_copy = None
         if config.record_base:

@@ -25,8 +25,7 @@ from hvt_common.runtime.log import START_LOGGER
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.config import EdgeConfig
 from hvt_edge.source.contract import Source
-from hvt_edge.source.demo import is_demo
-from hvt_edge.source.opening import SourceKinds, is_device, is_there, open_source, shown
+from hvt_edge.source.opening import SourceKinds, is_demo, is_device, is_there, open_source, shown
 from hvt_edge.video.encoder import Encoder, EncoderSettings
 from hvt_edge.video.qualification import Allowed
 from hvt_edge.video.reconfigure import EncoderReconfiguration

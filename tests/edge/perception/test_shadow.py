@@ -15,9 +15,9 @@ from hvt_common.values import Detections, Frame
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.perception.shadow import Detected, GroundDifference, Shadow, ShadowGround
 from hvt_edge.source.contract import SourceSettings
-from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
+from hvt_scene.source import DemoSource
 from rigs.examples import detections, tracks_of
 
 FPS = 15

@@ -31,12 +31,12 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.decoding import container
-from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.live import LiveSource
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.stream import StreamGrabber, is_description
 from hvt_scene import Scene
+from hvt_scene.source import DemoSource
 from media.numbered import number_of, numbered, write_numbered
 from programs.processes import eventually
 

@@ -1,16 +1,16 @@
 """The drawn demo scene, a sequence a seed, with exact labels: ``demo:0-4``, ``demo:1,5``.
 
-Words of the edge's source may stand among the seeds: ``demo:0-4,codes,4k`` (`hvt_edge.source.demo`).
+Words of the edge's source may stand among the seeds: ``demo:0-4,codes,4k`` (`hvt_scene.source`).
 """
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 
 from hvt_common.units import exact_rate
-from hvt_edge.source.demo import SCENE_WORDS, demo_scene
 from hvt_edge.source.resample import base_frame_count
 from hvt_scene import CodeInView, Scene
 from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_scene.source import SCENE_WORDS, demo_scene
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.options import parse_numbers
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence

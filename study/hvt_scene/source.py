@@ -1,6 +1,5 @@
-"""The drawn demo scene as a source. A package offers one by the entry point ``demo`` in the group ``hvt.scenes``.
+"""The drawn demo scene as a source of the edge, by the entry point ``demo`` in the group ``hvt.scenes``.
 
-`hvt_scene.Scene` shows its contract.
 ``demo:codes`` has codes painted on roofs, to be read; ``demo:4k`` has 3840x2160 pixels; ``demo:codes,4k`` both.
 
 It is drawn in a process of its own, as a camera is a device of its own: its ground takes 170 MB, and a picture 30 ms,
@@ -18,7 +17,6 @@ import sys
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +25,14 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Frame, Image, Pose
-from hvt_edge.source.contract import Source, SourceSettings
+from hvt_edge.source.contract import DrawnSource, SourceSettings
 from hvt_edge.source.resample import Resizer, capture_time_ns
+from hvt_scene.scene import Scene
 
 _END_S = 5.0
 _POSES_PER_S = 5
 SCENE_WORDS: Mapping[str, tuple[str, Any]] = {"codes": ("codes", True), "4k": ("size", (3840, 2160))}
 """Words that may follow ``demo:``, each with its argument of the scene."""
-
-
-def is_demo(spec: str) -> bool:
-    """Whether a source's name is the demo's, with or without words after a colon."""
-    return spec.partition(":")[0] == "demo"
 
 
 def demo_scene(spec: str) -> dict[str, Any]:
@@ -52,19 +46,17 @@ def demo_scene(spec: str) -> dict[str, Any]:
     return dict(SCENE_WORDS[word] for word in words)
 
 
-class DemoSource(Source):
+class DemoSource(DrawnSource):
     """The demo scene from its beginning to its end, at the base rate.
 
-    The frame at ``index`` shows the scene at the moment ``index / fps``. Raises `UserError` where no scene is
-    installed, or `demo_scene` does not accept ``spec``.
+    The frame at ``index`` shows the scene at the moment ``index / fps``. Raises `UserError` where `demo_scene` does
+    not accept ``spec``.
     """
 
     live = False
 
     def __init__(self, spec: str, settings: SourceSettings, *, seed: int) -> None:
         demo_scene(spec)  # names the fault here
-        if not entry_points(group="hvt.scenes", name="demo"):
-            raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
         self._drawing = subprocess.Popen(  # noqa: S603 - our own module
             [sys.executable, "-m", __name__, str(seed), spec],
             stdin=subprocess.PIPE,
@@ -93,13 +85,11 @@ class DemoSource(Source):
         self._drop_pictures()
 
     def write_truth(self, path: Path, *, fps: float) -> None:
-        """Write the ground truth of a flight at that rate; before the first frame."""
         self._drop_pictures()
         self._request("truth", path, fps, self.view)
         self._answer()
 
     def poses(self) -> list[Pose]:
-        """The camera's poses from the scene's beginning to its end; before the first frame."""
         self._request("poses")
         poses: list[Pose] = self._answer()
         return poses
@@ -148,8 +138,7 @@ def _end(drawing: subprocess.Popen[bytes]) -> None:
 
 
 def _draw(seed: int, spec: str) -> None:
-    (entry,) = entry_points(group="hvt.scenes", name="demo")
-    scene = entry.load()(seed, **demo_scene(spec))
+    scene = Scene(seed, **demo_scene(spec))
     # Not `sys.stdout.buffer`: with PYTHONUNBUFFERED it has no buffer, and a signal cuts its writes short.
     answers = io.BufferedWriter(io.FileIO(sys.stdout.fileno(), "w", closefd=False))
     requests = sys.stdin.buffer
@@ -167,14 +156,9 @@ def _draw(seed: int, spec: str) -> None:
             pickle.dump([scene.pose(number / _POSES_PER_S) for number in range(count + 1)], answers)
         else:
             path, fps, view = rest
-            pickle.dump(scene.write_truth(path, fps=fps, view=view), answers)
+            scene.write_truth(path, fps=fps, view=view)
+            pickle.dump(None, answers)
         answers.flush()
-
-
-def check_truth(path: Path | None, source: Source) -> None:
-    """Refuse ``--truth`` for a source without ground truth; `UserError`."""
-    if path is not None and not isinstance(source, DemoSource):
-        raise UserError(f"--truth {path} is for --source demo: no other source knows its truth")
 
 
 if __name__ == "__main__":
