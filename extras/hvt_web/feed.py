@@ -234,7 +234,9 @@ def _words(session: SessionState, *, calibrated: bool) -> list[str]:
         )
     words.append(_some(session.stills_received, "still"))
     trust = "" if calibrated else "; the probability of a class is not calibrated"
-    words.append(f"{_some(session.tracks, 'track')}, {session.tracks_refined} refined by stills{trust}")
+    words.append(
+        f"{_some(session.tracks, 'track')} so far, {session.tracks_refined} refined by stills{trust}"
+    )
     if session.view_unlike:
         words.append("this view is unlike what the detector knows: its boxes are thin and unnamed")
     if session.gaps:

@@ -60,6 +60,8 @@ _MOST_BYTES = 32 * 2**20
 _SMALL_BYTES = 512
 _TRACK_BYTES = 64
 """Size of each track of an overlay."""
+BEHIND_S = 10.0
+"""The first delay of a sink that is told; then twice that, and so on."""
 _POLL_S = 0.2
 _AT_ONCE = threading.Event()
 _AT_ONCE.set()
@@ -89,8 +91,9 @@ class QueuedSink(Generic[T]):
         self.for_backlog = for_backlog
         self._wait_s = wait_s
         self._changed = threading.Condition()
-        self._queue: deque[tuple[T, int, int]] = deque()
-        """Items, their sizes, and how many were dropped before each."""
+        self._queue: deque[tuple[T, int, int, float]] = deque()
+        """Items, their sizes, how many were dropped before each, and when they came (monotonic)."""
+        self._behind_s = BEHIND_S
         self._taken = 0
         """Items that ever were queued."""
         self._receipts: deque[tuple[int, Callable[[bool], None]]] = deque()
@@ -128,7 +131,7 @@ class QueuedSink(Generic[T]):
                 self._changed.wait_for(lambda: self._fits(size), self._wait_s)
             over = self._ending or self._failing
             if not over and self._fits(size):
-                self._queue.append((item, size, self._skipped))
+                self._queue.append((item, size, self._skipped, time.monotonic()))
                 self._taken += 1
                 self._queued_bytes += size
                 self._skipped = 0
@@ -255,12 +258,15 @@ class QueuedSink(Generic[T]):
             self._changed.wait_for(lambda: self._queue or self._ending)
             if not self._queue:
                 return None
-            item, size, skipped = self._queue.popleft()
+            item, size, skipped, came_s = self._queue.popleft()
             self._queued_bytes -= size
             self._in_hand = True
             if self._wait_s:
                 self._changed.notify_all()
-            return item, skipped
+        if (behind_s := time.monotonic() - came_s) >= self._behind_s:
+            self._behind_s = 2 * behind_s
+            _log.warning("%s is too slow: it is %d s behind, which a kill would lose", self.part, behind_s)
+        return item, skipped
 
     def _give_receipts(self) -> None:
         written: list[Callable[[bool], None]] = []

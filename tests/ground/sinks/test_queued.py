@@ -16,7 +16,7 @@ from hvt_common.errors import UserError
 from hvt_common.runtime import failures as failures_module
 from hvt_common.runtime.failures import Failures
 from hvt_ground.events import Event, Notice, VideoSample
-from hvt_ground.sinks import Outputs, QueuedSink
+from hvt_ground.sinks import Outputs, QueuedSink, queued
 from hvt_ground.sinks.queued import SinkWriter
 from hvt_ground.sinks.rerun.live_view import listening
 from hvt_ground.sinks.rerun.recorder import Recorder
@@ -58,8 +58,12 @@ def samples() -> list[VideoSample]:
     return [VideoSample(i, START_NS + i * STEP_NS, *unit) for i, unit in enumerate(units)]
 
 
-def test_a_disk_that_does_not_answer_holds_nobody_up(pipe, failures, caplog):
-    """The picture would stand still until a slow card has written, or the memory fill with what it is to write."""
+def test_a_disk_that_does_not_answer_holds_nobody_up(pipe, failures, caplog, monkeypatch):
+    """The picture would stand still until a slow card has written, or the memory fill with what it is to write.
+
+    A recording was half a minute behind without a word, and whoever took the power away lost it.
+    """
+    monkeypatch.setattr(queued, "BEHIND_S", 0.0)
     sink = QueuedSink("tracks table", lambda: LineFile(pipe, ("a",)), failures=failures)
     for _ in range(10_000):  # one that waited would wait for ever
         sink.log("x" * 100 + "\n")
@@ -71,6 +75,7 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(pipe, failures, caplog):
         lines = reader.read().splitlines()
     assert sink.join(time.monotonic() + 60)
     assert lines == ["a", *["x" * 100] * 4096], "what was taken is written, in whole lines"
+    assert "tracks table is too slow: it is 0 s behind, which a kill would lose" in caplog.messages
     assert failures.parts == (), "slow is not broken"
 
 

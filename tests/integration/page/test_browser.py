@@ -180,6 +180,7 @@ def test_what_an_operator_must_see_stands_on_the_picture(flight, page):
         eventually(lambda: page.inner_text("#standing").startswith("live, "), what="it is live")
         eventually(lambda: page.inner_text("#recording") == "recording", what="it is recorded")
         eventually(lambda: "500 kbps" in page.inner_text("#on-link"), what="what the link carries")
+        eventually(lambda: " so far, " in page.inner_text("#link-text"), what="not only the tracks of now")
         bottom = page.locator("#controls").evaluate("one => one.getBoundingClientRect().bottom")
         assert bottom <= viewport["height"], "sign, picture and playback, without scrolling"
     page.locator("#pause").click()
@@ -265,7 +266,10 @@ def test_the_page_fits_a_phone(flight):
     """Half of it would lie beside the screen."""
     page = flight.page(viewport={"width": 390, "height": 844}, color_scheme="light")
     shows(page)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    texts = "h2, #link-text, #failed, #events span"
+    lengthen = f"document.querySelectorAll('{texts}').forEach(one => one.append('a'.repeat(60)))"
+    page.evaluate(lengthen)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390, "with the longest names, too"
     page.context.close()
 
 
