@@ -2,7 +2,6 @@
 
 import ipaddress
 import os
-import re
 import socket
 import stat
 import struct
@@ -10,6 +9,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+from hvt_common.transport.zenoh_config import end_of, host_of
 
 TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 _UDP_TABLES = (Path("/proc/self/net/udp"), Path("/proc/self/net/udp6"))
@@ -47,14 +48,6 @@ def ends_of(end: str) -> set[str]:
     return set()
 
 
-def end_of(locator: object) -> str:
-    """The end that a locator of Zenoh's names, such as ``tcp/[::1]:7447?prio=1-3``: ``[::1]:7447``."""
-    host, _, port = re.sub(r"^\w+/|[?#].*", "", str(locator)).rpartition(":")
-    with suppress(ValueError):  # no address of a network
-        host = _host(ipaddress.ip_address(host.strip("[]").partition("%")[0]))
-    return f"{host}:{port}"
-
-
 def own_sockets() -> dict[int, int]:
     """Inode → descriptor, of this process."""
     found = {}
@@ -70,15 +63,9 @@ def end_in_table(text: str) -> str:
     """The end that the kernel writes as words of four bytes, in the machine's own order."""
     address, _, port = text.rpartition(":")
     words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
-    return f"{_host(ipaddress.ip_address(struct.pack(f'={len(words)}I', *words)))}:{int(port, 16)}"
+    return f"{host_of(ipaddress.ip_address(struct.pack(f'={len(words)}I', *words)))}:{int(port, 16)}"
 
 
 def end_of_name(name: tuple[Any, ...]) -> str:
     """The end of a socket's name."""
-    return f"{_host(ipaddress.ip_address(name[0].partition('%')[0]))}:{name[1]}"
-
-
-def _host(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
-    if isinstance(address, ipaddress.IPv6Address):
-        return str(address.ipv4_mapped or f"[{address}]")
-    return str(address)
+    return f"{host_of(ipaddress.ip_address(name[0].partition('%')[0]))}:{name[1]}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import re
 import socket
@@ -268,3 +269,18 @@ def _line_of(reason: str, text: str) -> str:
     found = re.search(r"`(\w+)`", reason)
     lines = [number for number, line in enumerate(text.splitlines(), 1) if found and found[1] in line]
     return f":{lines[0]}" if len(lines) == 1 else ""
+
+
+def end_of(locator: object) -> str:
+    """The end that a locator of Zenoh's names, such as ``tcp/[::1]:7447?prio=1-3``: ``[::1]:7447``."""
+    host, _, port = re.sub(r"^\w+/|[?#].*", "", str(locator)).rpartition(":")
+    with suppress(ValueError):  # no address of a network
+        host = host_of(ipaddress.ip_address(host.strip("[]").partition("%")[0]))
+    return f"{host}:{port}"
+
+
+def host_of(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
+    """As it stands in an end; an IPv4 address in IPv6 as itself."""
+    if isinstance(address, ipaddress.IPv6Address):
+        return str(address.ipv4_mapped or f"[{address}]")
+    return str(address)

@@ -20,8 +20,7 @@ import zenoh
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
-from hvt_common.transport.own_sockets import end_of
-from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
+from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints, end_of
 from hvt_fleet.link.certificate import SOON_S, TlsFiles, check_own_keys, dated, shown_to_callers
 from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
 from hvt_fleet.link.probe import why_no_link

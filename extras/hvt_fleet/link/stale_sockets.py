@@ -22,12 +22,11 @@ from hvt_common.transport.own_sockets import (
     LISTENING,
     TCP_TABLES,
     end_in_table,
-    end_of,
     end_of_name,
     ends_of,
     own_sockets,
 )
-from hvt_common.transport.zenoh_config import connect_endpoints
+from hvt_common.transport.zenoh_config import connect_endpoints, end_of
 
 _LISTENER = "listener"
 _EVERY_S = 0.25

@@ -17,9 +17,9 @@ import json5
 import pytest
 
 from hvt_common.runtime.failures import Failures
-from hvt_common.transport.own_sockets import TCP_TABLES, end_of, own_sockets
+from hvt_common.transport.own_sockets import TCP_TABLES, own_sockets
 from hvt_common.transport.session import open_session
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings, configure, end_of
 from hvt_fleet.link.stale_sockets import StaleSockets, same_socket
 from programs.fleet_keys import Fleet
 from programs.processes import eventually
