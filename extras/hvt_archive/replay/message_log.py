@@ -122,10 +122,9 @@ def _created(path: Path) -> BinaryIO:
 
 
 def read_log(path: Path) -> Iterator[Received]:
-    """The messages of a file, in the order in which they came, up to the first record that is not whole.
+    """The messages of a file, in the order in which they came, without those that are damaged.
 
-    Raises:
-        UserError: it cannot be read, or is no message log.
+    It ends at a record that is not whole. Raises `UserError` where it cannot be read, or is no message log.
     """
     with (
         telling(f"message log {path} cannot be read (", "): give one of hvt-ground --log"),
@@ -133,27 +132,33 @@ def read_log(path: Path) -> Iterator[Received]:
     ):
         if file.read(len(_MAGIC)) != _MAGIC:
             raise UserError(f"{path} is no message log of hvt-ground --log")
-        end = file.tell()
-        while (item := _read(file)) is not None:
-            end = file.tell()
-            yield item
-        if left := os.fstat(file.fileno()).st_size - end:
+        read_bytes = len(_MAGIC)
+        while (record := _read(file)) is not None:
+            if (item := _message(*record)) is not None:
+                read_bytes += _HEAD.size + len(record[1])
+                yield item
+        if left := os.fstat(file.fileno()).st_size - read_bytes:
             _say_broken(path, left)
 
 
 @cache
 def _say_broken(path: Path, left: int) -> None:
     # Once: a replay reads its files several times.
-    _log.warning("message log %s breaks off %d bytes before its end: what comes before is read", path, left)
+    _log.warning("message log %s breaks off or is damaged: %d bytes of it are left out", path, left)
 
 
-def _read(file: BinaryIO) -> Received | None:
+def _read(file: BinaryIO) -> tuple[int, bytes] | None:
+    # The checksum and content of a record.
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
     length, checksum = _HEAD.unpack(head)
     body = file.read(length) if length <= _MOST_BYTES else b""
-    if not body or len(body) < length or zlib.crc32(body) != checksum:
+    return (checksum, body) if body and len(body) == length else None
+
+
+def _message(checksum: int, body: bytes) -> Received | None:
+    if zlib.crc32(body) != checksum:
         return None
     try:
         values = msgpack.unpackb(body, max_ext_len=0)
