@@ -44,6 +44,10 @@ _FORGET_NS = 15 * SECOND_NS
 get video at the least rate, since behind a router the link may be gone all the same."""
 _LATE_NS = 3 * SECOND_NS
 """Where all named messages have come late for this long, the path is longer than it was."""
+_QUEUE_NS = SECOND_NS
+"""Where two named in a row came later than this, those behind them stand in a queue that must empty first, …"""
+_STALL_NS = SECOND_NS
+"""… unless none of them has come for this long: they are lost."""
 _MEMORY_NS = 15 * SECOND_NS
 """What was measured counts for this long."""
 _MOST_RECORDS = 1024
@@ -66,6 +70,8 @@ class Sent:
     """Line bytes of everything sent so far, this message included."""
     messages: int
     """Messages of base and stills sent so far, this one included: reports count the lost messages of both."""
+    alone: bool
+    """No other base message was on its way: its round trip is the path's, and no queue's."""
 
 
 class Flight:
@@ -90,6 +96,11 @@ class Flight:
     @property
     def oldest(self) -> Sent | None:
         return self._base[0] if self._base else None
+
+    @property
+    def next_due(self) -> Sent | None:
+        """The oldest that may yet come, also where it was given up."""
+        return self._given_up[0] if self._given_up else self.oldest
 
     @property
     def newest(self) -> Sent | None:
@@ -120,8 +131,9 @@ class Flight:
         if base is not None:
             self._last = (base, self._last[1])
             serialization_ns = self.backlog_ns(now_ns=now_ns, rate_bps=rate_bps)
+            alone = self.next_due is None
             self._base.append(
-                Sent(base, now_ns, serialization_ns, line_bytes, self._total_bytes, self._messages)
+                Sent(base, now_ns, serialization_ns, line_bytes, self._total_bytes, self._messages, alone)
             )
 
     def backlog_ns(self, *, now_ns: int, rate_bps: int) -> int:
@@ -270,8 +282,13 @@ class Pacer:
         """The first message sent as a probe, until a report tells whether the overdue one is lost."""
         self._doubt_ns = self._open_ns = 0
         self._late_since_ns: int | None = None
-        """Since when all named messages came late; `_late` is the shortest round trip of messages sent since then."""
-        self._late = LeastDelay()
+        """Since when all named messages came late."""
+        self._alone = LeastDelay()
+        """The shortest round trip of messages sent since then, each with no other on its way."""
+        self._queued = False
+        """Whether the message named last came so late that it stood in a queue of more than `_QUEUE_NS`."""
+        self._drain_to = -1
+        """The base message that must have come, or be lost, before another frame goes."""
         self._last_sent_ns = self._last_bytes = 0
         self._linked: bool | None = None
         self._reports = True
@@ -352,15 +369,23 @@ class Pacer:
             self._note_losses(feedback, now_ns)
             oldest = self._flight.oldest
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
-            if silent:  # at the least rate waiting for the rest would take longer than giving it up
-                self._flight.clear()
-            return_ns = now_ns - feedback.send_ns
-            if sent is None or (
-                sent.sequence <= self._given_up and not self._take_longer(sent, return_ns, now_ns)
-            ):
+            given_up = self._given_up
+            if silent:
+                self._give_up_all()
+            if sent is None:
                 return
-            held_ns = 1000 * feedback.base_held_us
-            self._note_late(sent, held_ns, now_ns)
+            self._progress_ns = now_ns
+            return_ns, held_ns = now_ns - feedback.send_ns, 1000 * feedback.base_held_us
+            late_back_ns = 0 if self._return.empty else max(0, return_ns - self._return_ns)
+            before, self._queued = (
+                self._queued,
+                self._late_ns(sent, now_ns) - held_ns - late_back_ns > _QUEUE_NS,
+            )
+            if self._queued and before:
+                self._drain_to = self._flight.last_base
+            if sent.sequence <= given_up and not self._take_longer(sent, return_ns, now_ns):
+                return
+            self._note_late(sent, oldest or sent, held_ns, now_ns)
             # The oldest message that this report names has waited for it since the report before.
             self._note_times(
                 sent, held_ns + max(0, sent.sent_ns - (oldest or sent).sent_ns), return_ns, now_ns
@@ -450,9 +475,12 @@ class Pacer:
         if min(self._overdue_ns(now_ns), now_ns - self._progress_ns) <= _GIVEN_UP_NS:
             return False
         self._controller.on_silence(now_ns)
+        self._give_up_all()
+        return True
+
+    def _give_up_all(self) -> None:
         self._given_up = self._flight.last_base
         self._flight.give_up()
-        return True
 
     def _may_start(self, now_ns: int) -> bool:
         if not self._linked or not self._reports or self._started_ns is None:
@@ -460,6 +488,9 @@ class Pacer:
         return not _START_NS <= now_ns - self._started_ns < _START_NS + _START_HOLD_NS
 
     def _is_open(self, now_ns: int, most_backlog_ns: int) -> bool:
+        due = self._flight.next_due
+        if due is not None and due.sequence <= self._drain_to and now_ns - self._progress_ns <= _STALL_NS:
+            return False
         backlog_ns = self._flight.backlog_ns(now_ns=now_ns, rate_bps=self.rate_bps)
         return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= self._slack_ns
 
@@ -505,7 +536,7 @@ class Pacer:
     def _forget_path(self) -> None:
         self._held_ns = _FIRST_HELD_NS
         self._round_trip, self._return = LeastDelay(), LeastDelay()
-        self.round_trip_ns = SECOND_NS // 2
+        self.round_trip_ns, self._drain_to = SECOND_NS // 2, -1
         self._controller.forget_path()
 
     def _take_longer(self, sent: Sent, return_ns: int, now_ns: int) -> bool:
@@ -518,22 +549,26 @@ class Pacer:
         self._round_trip.add(round_trip_ns, now_ns=now_ns)
         return True
 
-    def _note_late(self, sent: Sent, held_ns: int, now_ns: int) -> None:
-        # The rate falls at once, and the queue with it: if messages stay late after that, the path is longer.
+    def _note_late(self, sent: Sent, oldest: Sent, held_ns: int, now_ns: int) -> None:
+        # The rate falls at once, and the queue with it: if messages stay late after that, also one that was sent
+        # when no other was on its way, the path is longer.
         if self._late_ns(sent, now_ns) - held_ns <= _SLACK_NS:
             self._late_since_ns = None
         elif self._late_since_ns is None:
-            self._late_since_ns, self._late = now_ns, LeastDelay()
-        elif sent.sent_ns >= self._late_since_ns:
-            least_ns = self._late.add(now_ns - sent.sent_ns, now_ns=now_ns)
-            if now_ns - self._late_since_ns >= _LATE_NS:
-                self._round_trip, self._late_since_ns = self._late, None
-                self.round_trip_ns = least_ns
+            self._late_since_ns, self._alone = now_ns, LeastDelay()
+        elif oldest.sent_ns >= self._late_since_ns:
+            if oldest.alone:
+                self._alone.add(now_ns - oldest.sent_ns, now_ns=now_ns)
+            if now_ns - self._late_since_ns < _LATE_NS:
+                return
+            if self._alone.empty:
+                self._drain_to = self._flight.last_base
+            else:
+                self._round_trip, self._late_since_ns = self._alone, None
 
     def _note_times(self, sent: Sent, held_ns: int, return_ns: int, now_ns: int) -> None:
         # Rises quickly and falls slowly: the estimate is the longest of the usual times.
         held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
         self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
-        self._progress_ns = now_ns
         self.round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)
         self._return_ns = self._return.add(return_ns, now_ns=now_ns)

@@ -75,6 +75,16 @@ def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps):
     assert flight.longest_hole(0, 40) < 2
 
 
+@pytest.mark.parametrize(
+    ("budget", "steps"), [(5_000_000, [(0, 4e4)]), (800_000, [(0, 6e4), (20, 0), (40, 6e4)])]
+)
+def test_a_queue_of_many_seconds_is_emptied_and_taken_for_no_longer_route(budget, steps):
+    """Below the floor each picture would be half a minute old for the whole flight, and the next older still."""
+    flight = flown(80, *steps, size=(1280, 720), budget=budget, way_s=lambda _second: 0.3)
+    assert max(flight.delays_between(65, 80)) < 4
+    assert flight.longest_hole(65, 80) < 2
+
+
 def test_a_fall_to_a_fifth_and_back():
     """Behind a hill the picture would be seconds old; past it, it would stay as coarse as behind it."""
     flight = flown(60, (0, 1e6), (15, 2e5), (35, 1e6))
