@@ -6,7 +6,7 @@ import random
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
@@ -49,7 +49,6 @@ def brute_worst(items, channel):
 
 
 @given(gaps=events)
-@settings(max_examples=150, deadline=None)
 def test_windows_and_worst_windows_are_exact(gaps):
     """The budget would be held on average and broken in some second."""
     items = dated(gaps)
@@ -65,7 +64,6 @@ def test_windows_and_worst_windows_are_exact(gaps):
 
 
 @given(gaps=events, seed=st.integers(0, 10_000))
-@settings(max_examples=150, deadline=None)
 def test_slightly_other_order_gives_the_same_account(gaps, seed):
     """Edge and ground would print two different sums of the same bytes: stills overtake, clocks do not."""
     items = dated(gaps)

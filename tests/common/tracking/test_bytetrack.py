@@ -141,7 +141,6 @@ def test_the_split_filter_equals_the_dense_one():
 
 
 @given(seed=seeds, rows=st.integers(0, 7), columns=st.integers(0, 7), limit=st.floats(0.05, 1))
-@settings(max_examples=150, deadline=None)
 def test_assignment_has_the_optimum_of_lap_with_a_cost_limit(seed, rows, columns, limit):
     """Where objects are close, tracks would take other detections than in ByteTrack."""
     cost = np.random.default_rng(seed).random((rows, columns))
@@ -173,7 +172,7 @@ def test_overlap_counts_whole_pixels():
 
 
 @given(seed=seeds, every=st.sampled_from([1, 3]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_order_of_detections_does_not_matter(seed, every):
     """Edge and ground would number the same objects differently when their detectors order boxes differently."""
     rng = np.random.default_rng(seed)
@@ -194,7 +193,7 @@ def test_order_of_detections_does_not_matter(seed, every):
 
 
 @given(seed=seeds, dx=st.integers(-500, 500), dy=st.integers(-500, 500))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_tracks_move_with_the_picture(seed, dx, dy):
     """Objects would be tracked differently in one corner of the frame than in another."""
     detections = scene(seed)
@@ -206,7 +205,7 @@ def test_tracks_move_with_the_picture(seed, dx, dy):
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 90), st.booleans()), max_size=20))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_sequence_of_calls_is_survived(calls):
     """An empty street, a gap in the stream or a pause of the detector would stop the edge or the ground."""
     tracker, frame = ByteTracker(fps=15), 0
@@ -358,7 +357,7 @@ def test_gaps_are_stepped_like_predicted_frames():
 
 
 @given(seed=seeds, ahead=st.integers(0, 80))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_looking_ahead_shows_what_prediction_would_and_changes_nothing(seed, ahead):
     """A list shown between two frames would differ from the track, or move it."""
     asked, other = ByteTracker(fps=15), ByteTracker(fps=15)

@@ -19,7 +19,7 @@ WHOLE: dict[str, Any] = {"low_pct": 1, "high_pct": 100}
 
 @pytest.mark.parametrize("name", ["jpeg", "h264-intra", "residual"])
 @given(limit_bytes=st.integers(100, 4000))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_the_best_that_fits(name, limit_bytes):
     """A still would overrun its admission, or leave bytes unused that were paid for."""
     codec = still_codec(name)

@@ -293,7 +293,7 @@ def test_requests_of_another_session_and_floods_are_refused():
     assert rig.commands.answer(mine).accepted
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     totals=st.lists(st.sampled_from([200_000, 400_000, 800_000, 1_400_000]), min_size=2, max_size=4),

@@ -90,7 +90,7 @@ def budgets(
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(one=budgets(), seed=st.integers(0, 2**32 - 1), burst=st.floats(0.0, 3.0), greed=st.floats(0.1, 1.0))
 def test_no_rolling_window_exceeds_the_total(one, seed, burst, greed):
     """The link would be asked for more than the user has, in some second of the flight."""
@@ -107,7 +107,7 @@ def test_no_rolling_window_exceeds_the_total(one, seed, burst, greed):
     assert run.fullest(one.window_ns) <= total_bytes(one)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(one=budgets(borrow_unused=False), seed=st.integers(0, 2**32 - 1))
 def test_stills_keep_to_their_share(one, seed):
     """Stills would live on what the base leaves, and the base's quality would be paid for twice."""
@@ -122,7 +122,7 @@ def test_stills_keep_to_their_share(one, seed):
         assert fullest <= share * (seconds + one.carry_s) + 1
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(one=budgets(), seed=st.integers(0, 2**32 - 1))
 def test_a_base_message_waits_no_longer_than_a_window_and_keeps_its_order(one, seed):
     """A picture would come late for nothing, or before the one that it rests on."""
@@ -143,7 +143,7 @@ def test_a_base_message_waits_no_longer_than_a_window_and_keeps_its_order(one, s
         last_ns = at_ns
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     total=st.sampled_from([60_000, 300_000, 800_000]),
     share=st.floats(0.5, 0.97),
@@ -187,7 +187,7 @@ def test_messages_of_one_moment_leave_the_window_together():
     assert run.base(8_000, START_NS + 600_000_000) == START_NS + SECOND_NS
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), one=budgets(windows=(0.5, 1.0)), skew=st.integers(0, 300_000_000))
 def test_two_threads_with_times_a_little_apart_hold_it_too(seed, one, skew):
     """The still thread decides at a time that has passed, while a base message already waits for a later one."""
@@ -363,7 +363,7 @@ def test_a_loan_is_counted_and_what_is_kept_for_others_is_not_lent(every, use):
     assert rate_bps == pytest.approx(66_000 + (1 - use) * 140_000, abs=14_000)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     one=budgets(windows=(1.0,)),
     seed=st.integers(0, 2**32 - 1),

@@ -213,7 +213,6 @@ _NUMBERS = st.integers(-(2**63) + 1, 2**63 - 1) | st.floats(-1e300, 1e300) | st.
 _FAR_BOXES = st.tuples(*[st.floats(-30_000, 0)] * 2, *[st.floats(0, 32_000)] * 2)
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     class_name=_NAMES,
     reason=_NAMES,
@@ -478,7 +477,7 @@ def test_a_class_that_the_session_lists_is_sent_as_its_place_there():
         headers[0].named(("van",))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     total_bps=st.sampled_from([12_000, 25_000, 100_000, 800_000]),
     fps=st.sampled_from([1, 2, 5, 15, 30]),

@@ -92,7 +92,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(steps=STEPS, source=st.sampled_from(["lockstep", "camera", "clip"]), decimation=st.integers(1, 3))
 def test_every_source_frame_is_in_one_group(steps, source, decimation):
     """The end would say "71 of 220" and be silent about the others; it may come at any frame, as by Ctrl-C."""

@@ -52,7 +52,7 @@ def test_with_little_memory_it_goes_back_as_far_with_frames_left_out():
         assert one.frame_index == pytest.approx(399 - 15 * ago, abs=5.1)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     count=st.integers(0, 120),
     max_bytes=st.integers(0, 40_000),

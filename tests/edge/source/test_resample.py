@@ -78,7 +78,7 @@ def test_time_stamps_that_run_backwards_replace_and_never_rewind():
 
 
 @given(camera=st.floats(5, 120), base=st.floats(1, 60), jitter=st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_jittery_camera_is_brought_to_the_base_rate_on_average(camera, base, jitter):
     """A 30 fps camera at 15 fps would slip to 10 fps, or overrun the encoder's budget."""
     rng = np.random.default_rng(jitter)

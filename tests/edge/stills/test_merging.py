@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
@@ -61,7 +61,6 @@ def line_bytes(one: Request, cost: CostEstimate, overhead: float) -> float:
     return payload + overhead + ALSO_BYTES * len(one.also)
 
 
-@settings(max_examples=150, deadline=None)
 @given(some=requests_of(), cost=COSTS, overhead=st.floats(0, 300))
 def test_sharing_never_costs_more_and_loses_nobody(some, cost, overhead):
     """Sharing would waste what it is there to save, or an object would never get its still."""

@@ -46,7 +46,7 @@ def shown(still: Still) -> Image:
     return np.asarray(cv2.resize(image, SIZE, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(base_pct=st.integers(1, 99), wanted_pct=st.integers(5, 95), most_bytes=st.integers(200, 60_000))
 def test_what_comes_is_closer_to_the_source_than_the_video_and_fits(base_pct, wanted_pct, most_bytes):
     """An operator who looks closer would see less than before, or wait for what never fits."""
@@ -113,7 +113,7 @@ def test_a_refusal_names_the_least_that_shows_more_and_no_coding_is_made_twice()
     assert len(made) == len(set(made))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     total_bps=st.sampled_from([100_000, 300_000, 800_000, 2_000_000]),

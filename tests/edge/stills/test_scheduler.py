@@ -243,7 +243,7 @@ def test_stills_that_build_on_the_base_wait_for_a_frame_that_has_one():
     assert plain.stills(100_000) == [], "and a forged request does not double what a ground has"
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(
         st.tuples(st.sets(st.integers(0, 30), max_size=6), st.integers(0, 6_000), st.booleans()),

@@ -111,7 +111,7 @@ def test_nothing_is_proposed_before_the_scene_is_known_or_for_a_trifle():
     assert one.share == settled
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     total=st.sampled_from([100_000, 150_000, 300_000, 800_000]),
     metadata=st.sampled_from([0, 8_000]),

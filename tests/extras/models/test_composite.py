@@ -103,7 +103,7 @@ def test_stills_at_the_border_and_shrunk_stills_fit():
     assert picture[[3, -3, 90], [3, -3, 230]].tolist() == [[0, 0, 255], [0, 255, 0], [0, 0, 255]]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     st.tuples(st.integers(0, 1279), st.integers(0, 719), st.integers(1, 700), st.integers(1, 700)),
     st.sampled_from(["letterbox", "crop"]),

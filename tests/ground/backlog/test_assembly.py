@@ -143,7 +143,7 @@ chunk_of = st.tuples(
 
 
 @given(reported=st.lists(chunk_of, max_size=40))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_whatever_comes_it_stays_within_bounds(reported):
     """A hostile sender would crash the ground or make it grow."""
     assembly = BacklogAssembly(max_objects=3, max_bytes=MAX_BACKLOG_BYTES + QUARTER, remember=2)
@@ -189,7 +189,6 @@ def test_acknowledgements_that_nobody_fetches_are_bounded():
     cuts=st.lists(st.integers(1, 299), max_size=6),
     seed=st.integers(0, 2**32),
 )
-@settings(max_examples=150, deadline=None)
 def test_an_edge_that_follows_the_acknowledgements_gets_everything_across(data, cuts, seed):
     """Lost, doubled or reordered chunks would leave an object unfinished for ever."""
     assembly, chance = BacklogAssembly(), random.Random(seed)
@@ -252,7 +251,6 @@ def test_objects_that_are_another_inside_are_refused(flight):
 
 
 @given(numbers=st.lists(st.integers(0, 20_000), max_size=80))
-@settings(max_examples=100, deadline=None)
 def test_numbers_are_known_again_in_any_order(numbers):
     """A still that was missed long ago would be taken for one that has been shown."""
     seen, plain = SequenceWindow(), set()

@@ -397,7 +397,6 @@ units = st.tuples(st.booleans(), st.booleans(), st.integers(0, 2), st.sampled_fr
 """keyframe, lost, extra copies, positions late."""
 
 
-@settings(deadline=None, max_examples=200)
 @given(
     pattern=st.lists(units, max_size=60),
     copies_late=st.integers(0, 80),
@@ -440,7 +439,6 @@ hostile = st.tuples(
 )
 
 
-@settings(deadline=None, max_examples=200)
 @given(messages=st.lists(hostile, max_size=60))
 def test_forged_headers_neither_grow_memory_nor_end_the_picture(messages):
     """Anyone who can send a packet could crash the ground, fill its memory or darken it for good."""
@@ -464,7 +462,7 @@ def test_forged_headers_neither_grow_memory_nor_end_the_picture(messages):
     assert (last.verdict, last.header.session_id, last.header.sequence) == ("decode", -1, 59)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(sessions=st.lists(st.integers(2, MAX_U64), min_size=50, max_size=200), keys=st.booleans())
 def test_a_flood_of_invented_sessions_does_not_disturb_a_live_one(sessions, keys):
     """A stranger on the same key could reset the operator's screen with every packet."""

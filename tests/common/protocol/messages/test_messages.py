@@ -114,7 +114,7 @@ any_message = st.sampled_from(MESSAGES).flatmap(message_of)
 
 
 @given(message=any_message, payload=st.binary(max_size=200))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_every_message_survives_the_wire(message, payload):
     """A user would see boxes, classes or counts other than those the edge meant."""
     assert type(message).parse(message.pack(payload), payload) == message

@@ -4,7 +4,7 @@ from dataclasses import replace
 from math import exp
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
@@ -72,7 +72,6 @@ def test_an_object_that_the_base_does_not_show_comes_first():
     assert gains[1] < 0.05
 
 
-@settings(max_examples=120, deadline=None)
 @given(
     lost=st.floats(0, 1),
     confidence=st.floats(0.1, 1),

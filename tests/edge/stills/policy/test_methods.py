@@ -58,7 +58,7 @@ def candidates(draw):
 
 @pytest.mark.parametrize("name", METHODS)
 @given(given_candidates=candidates(), room=st.floats(0, 50_000), seed=st.integers(0, 9))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_every_method_is_a_pure_function_of_its_input(name, given_candidates, room, seed):
     """The same flight would give other stills each time, and tables that nobody can reproduce."""
     policy, moment = method(name), step(allowance_bytes=room)
@@ -166,7 +166,7 @@ def test_m5_known_answer(changes, doubt, new):
 
 
 @given(candidates(), st.integers(0, 24), st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_m5_score_is_monotone_in_every_term(some, index, draw):
     """More doubt, less area, longer silence or lower cost would make an object less wanted."""
     if not some:

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_edge.stills.policy.registry import method
@@ -63,7 +63,6 @@ detection = st.tuples(
 
 @pytest.mark.parametrize("name", BY_NAME)
 @given(st.lists(detection, max_size=30))
-@settings(max_examples=120, deadline=None)
 def test_selectors_agree_with_the_table(name, rows):
     """The selector table of a user's clip would not be the pilot's."""
     boxes = np.array([(x, y, x + w, y + h) for x, y, w, h, _, _ in rows], np.float32).reshape(-1, 4)

@@ -359,7 +359,7 @@ def test_fusing_survives_certainty_and_long_runs():
 shares = st.lists(st.floats(0, 1, width=32), min_size=3, max_size=3).filter(lambda p: sum(p) > 0.01)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     answers=st.lists(shares, min_size=1, max_size=12),
     mode=st.sampled_from(["fuse", "replace"]),
@@ -385,7 +385,6 @@ def test_the_order_in_which_stills_come_does_not_matter(answers, mode, data):
 steps = st.tuples(st.integers(0, 4), st.booleans(), st.integers(0, 3), st.integers(0, 8))
 
 
-@settings(deadline=None, max_examples=100)
 @given(script=st.lists(steps, min_size=1, max_size=40))
 def test_objects_that_stand_apart_are_never_confused(script):
     """Whatever is lost, late or missing, an object would get the class of another."""

@@ -179,7 +179,7 @@ def test_the_colours_that_are_shown_stand_in_the_legend(tmp_path):
 
 
 @given(events=st.lists(st.tuples(st.booleans(), st.integers(0, 60)), max_size=60))
-@hypothesis_settings(max_examples=300, deadline=None)
+@hypothesis_settings(max_examples=300)
 def test_each_pair_is_held_for_a_while_whatever_comes_when(events):
     """Pairs would flicker by, or an old one would push out what is shown at its time."""
     gallery, newest, taken = Gallery(3, hold_ns=2), 0, set()
