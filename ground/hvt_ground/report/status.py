@@ -135,11 +135,12 @@ def completed(
     queued = [sink for sink in sinks if isinstance(sink, QueuedSink)]
     files = dict.fromkeys(path for sink in queued for path in sink.files)  # a removed one may come again
     recordings = [path for path in files if path.suffix == ".rrd"]
-    sizes = [path.stat().st_size for path in recordings if path.exists()]
+    sizes = {path: path.stat().st_size for path in recordings if path.exists()}
+    recordings = list(sizes) or recordings  # retention removes the oldest in flight
     return content | {
         "recording": str(recordings[0]) if recordings else None,
         "recordings": [str(path) for path in recordings],
-        "recording_bytes": sum(sizes) if sizes or not recordings else None,
+        "recording_bytes": sum(sizes.values()) if sizes or not recordings else None,
         "missing_events": {sink.part: sink.missing for sink in queued if sink.missing},
         "unusable_messages": sessions.receiver.unusable,
         "backlog": content["backlog"] | {"recordings": [str(path) for path in sessions.backlog.paths]},
