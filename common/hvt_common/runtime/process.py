@@ -8,7 +8,6 @@ Also the messages to systemd.
 import atexit
 import contextlib
 import ctypes
-import functools
 import math
 import os
 import signal
@@ -131,7 +130,6 @@ def leave(code: int) -> NoReturn:
     os._exit(code)
 
 
-@functools.cache
 def lower_priority(*, little: bool = False) -> None:
     """Let other threads go before the calling one, and before those that it starts; on Linux only.
 
