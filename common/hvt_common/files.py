@@ -181,19 +181,23 @@ def _is_gone(path: Path) -> bool:
 def created(path: Path, flags: int = 0) -> int:
     """A descriptor to write a new file with, in place of one of that name; until it is closed the file is locked.
 
-    Raises `OSError`, also where another program is at work on the file; a pipe or a device has no lock.
+    Raises `OSError`, also where another program is at work on the file, or was while this waited; a pipe or a device
+    has no lock.
     """
-    for _ in range(_LOCK_TRIES):
+    for waited in range(_LOCK_TRIES):
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | flags, 0o644)
-        found = os.fstat(file)
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(os.fstat(file).st_mode):
             return file
+        ours, found = takes_lock(file), os.fstat(file)
+        is_others = found.st_size and (waited or not ours)
         # The index removes empty files that nobody has locked: this one perhaps, just now.
-        if takes_lock(file) and os.fstat(file).st_nlink:
+        if ours and found.st_nlink and not is_others:
             if found.st_size:
-                os.ftruncate(file, 0)  # not before: another program may be writing it
+                os.ftruncate(file, 0)
             return file
         os.close(file)
+        if is_others:
+            break
         time.sleep(_LOCK_PAUSE_S)
     raise OSError(errno.EBUSY, "another program is at work on it")
 

@@ -7,7 +7,8 @@ import subprocess
 
 import pytest
 
-from hvt_common.files import check_there, locked
+from hvt_common import files
+from hvt_common.files import check_there, created, locked
 
 
 def test_one_on_a_disk_that_was_unmounted_is_noticed(tmp_path):
@@ -34,6 +35,22 @@ def test_one_that_was_moved_is_there(tmp_path):
         (tmp_path / "kept" / path.name).unlink()
         with pytest.raises(FileNotFoundError, match="it was removed"):
             check_there(file.fileno(), path)
+
+
+def test_one_that_another_program_finished_meanwhile_is_left_as_it_is(tmp_path, monkeypatch):
+    """A ground that had waited for the other's lock took its flight once it had it."""
+    path = tmp_path / "flight"
+    with path.open("wb", buffering=0) as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+
+        def finishes(_: float) -> None:
+            other.write(b"flight")
+            other.close()
+
+        monkeypatch.setattr(files.time, "sleep", finishes)
+        with pytest.raises(OSError, match="another program is at work on it"):
+            created(path)
+    assert path.read_bytes() == b"flight"
 
 
 def test_who_cannot_have_a_lock_is_told(tmp_path, monkeypatch, caplog):

@@ -16,7 +16,7 @@ from hvt_common.files import has_nothing
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, all_extras, checked, config_class
 from hvt_ground.wiring import check_outputs, make_folders, output_path, set_aside
-from hvt_ground.wiring.sessions import backlog_path, free_path
+from hvt_ground.wiring.sessions import backlog_path, free_path, open_again
 
 
 def read(*argv: str) -> GroundConfig:
@@ -174,7 +174,7 @@ def test_what_was_moved_stays_where_each_start_is_of_the_same_time(tmp_path, mon
     assert sorted(one.read_text() for one in tmp_path.glob("earlier-*/f.rrd")) == flights
 
 
-def test_nothing_is_moved_from_under_a_ground_that_still_writes_it(tmp_path):
+def test_nothing_is_moved_from_under_a_ground_that_still_writes_it(tmp_path, caplog):
     """A second one that is started by mistake took its files from under the first."""
     for one in ("f.rrd", "t.csv", "o.mcap"):
         (tmp_path / one).write_text(one)
@@ -187,6 +187,39 @@ def test_nothing_is_moved_from_under_a_ground_that_still_writes_it(tmp_path):
     (earlier,) = tmp_path.glob("earlier-*")
     assert {one.name for one in tmp_path.iterdir()} == {"t.csv", "o.mcap", earlier.name}
     assert [one.name for one in earlier.iterdir()] == ["f.rrd"]
+    assert f"--tracks {tmp_path / 't.csv'} is another program's, which writes it now" in caplog.text
+
+
+def test_what_another_ground_has_written_is_never_written_over(tmp_path, monkeypatch):
+    """A second one was refused the files of the first, and its next try took their contents once that had ended."""
+    named, second = tmp_path / "f.rrd", {"suffix": ".rrd", "edge": "uav-1", "stamp": "t"}
+    kept, taken = [], set()
+
+    def refused(path: Path) -> None:
+        path.write_text("of another ground")  # between the choice of the name and the opening
+        raise UserError("another program is at work on it")
+
+    def name(**more: bool) -> str:
+        return output_path(named, taken=set(), **second, **more).name
+
+    with pytest.raises(UserError):
+        open_again(named, taken, refused)
+    for _ in range(2):
+        open_again(named, taken, kept.append)
+    assert [one.name for one in kept] == ["f-2.rrd", "f-3.rrd"]
+    assert name() == "f-uav-1.rrd"
+    with pytest.raises(UserError):
+        open_again(named, set(), refused)
+    assert (tmp_path / "f-4.rrd").exists(), "nor is it removed"
+    assert name(claim=False) == "f.rrd", "the beginning of f-0001.rrd"
+    named.write_text("")
+    with named.open() as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert name() == "f-uav-1-2.rrd"
+    assert name() == "f.rrd"
+    named.write_text("of a flight that cannot be moved")
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert name() == "f.rrd", "where the folder takes no other, this flight would not be recorded"
 
 
 def test_two_grounds_of_one_folder_never_get_one_name(tmp_path):

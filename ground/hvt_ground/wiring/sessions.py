@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from glob import escape
@@ -103,7 +103,12 @@ def set_aside(config: GroundConfig) -> None:
             continue
         folder = file.with_name(free)
         try:
-            if not file.stat().st_size or _is_written(file):
+            if not file.stat().st_size:
+                continue
+            if _is_written(file):
+                _log.warning(
+                    "%s %s is another program's, which writes it now: here the name differs", name, path
+                )
                 continue
             with suppress(OSError):  # on a full disk there may be no room for a folder, but for a name
                 folder.mkdir(exist_ok=True)
@@ -111,7 +116,10 @@ def set_aside(config: GroundConfig) -> None:
             for one in chain([file], file.parent.glob(escape(file.stem) + beside) if beside else ()):
                 one.rename(into + one.name)
         except OSError as error:
-            _log.warning("%s %s is written over: it cannot be moved (%s)", name, path, error.strerror)
+            _log.warning(
+                "%s %s cannot be moved (%s): it is written over where its folder takes no other file",
+                *(name, path, error.strerror),
+            )
         else:
             _log.warning("%s %s was there already: it is %s now", name, path, into + file.name)
 
@@ -134,10 +142,9 @@ def output_path(
 ) -> Path:
     """The path of a session's file, noted in ``taken``.
 
-    ``target`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file
-    is written anew, but each session of this process gets one of its own: the first takes the name, others have the
-    edge's id in it. A file that nobody named is never overwritten. Without ``claim`` the name is but the beginning of
-    others, and no file.
+    ``target`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. The first
+    session takes a named file, others have the edge's id in the name; see `free_path`. Without ``claim`` the name is
+    but the beginning of others, and no file.
     """
     if target is None or not is_file(target, suffix):
         first = further = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
@@ -162,36 +169,45 @@ def free_path(
 ) -> Path:
     """The first that is free of the names and of the last one with a number from ``number`` on; it is taken.
 
-    With ``claim`` it is an empty file then, unless it is ``may_exist``: two grounds may share a folder. Such a file
-    shows by itself that it is taken.
+    With ``claim`` it is an empty file then: two grounds may share a folder. Such a file shows by itself that it is
+    taken. ``may_exist`` may be a file, but none that another ground writes or has written.
     """
     is_free = claim_name if claim else lambda one: not one.exists()
     last = names[-1]
     numbered = (last.with_name(f"{last.stem}-{count}{last.suffix}") for count in count_from(number))
-    path = next(
-        one for one in chain(names, numbered) if one not in taken and (one == may_exist or is_free(one))
-    )
+    for path in chain(names, numbered):
+        if path not in taken and (is_free(path) if path != may_exist else not claim or _may_begin(path)):
+            break
     if path == may_exist or not claim:
         taken.add(path)
     return path
+
+
+def _may_begin(path: Path) -> bool:
+    # Where the folder takes no other file it is this one or none.
+    if not path.is_file() or not os.access(path.parent, os.W_OK | os.X_OK):
+        return True
+    return not path.stat().st_size and not _is_written(path)
 
 
 T = TypeVar("T")
 
 
 def open_again(named: Path, taken: set[Path], make: Callable[[Path], T]) -> T:
-    """Open the file; one that was opened before and failed stays as it is: the next has a number in its name.
+    """Open the file; one that was opened before and failed stays as it is: the next has a number in its name."""
+    return _opened(make, partial(free_path, [named], taken, number=2, may_exist=named), taken, {named})
 
-    Where ``make`` raises, no numbered file stays, however often that is.
-    """
-    path = free_path([named], taken, number=2, may_exist=named)
+
+def _opened(make: Callable[[Path], T], name: Callable[[], Path], taken: set[Path], named: set[Path]) -> T:
+    # A name that could not be used is free again, and no empty file of it stays, however often that is.
+    path = name()
     try:
         return make(path)
     except BaseException:
         taken.discard(path)
-        if path != named:
+        if path not in named and has_nothing(path):
             with suppress(OSError):
-                path.unlink()
+                path.unlink(missing_ok=True)
         raise
 
 
@@ -315,20 +331,11 @@ class SessionFactory:
             self.models.failures.attempt(part_of(one), one.recorded, None, row)
 
     def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
-        # A sink with a file; a name that could not be used is free again.
-        with self._naming:
-            path = name(taken=self._paths)
-        with ExitStack() as undo:
-            undo.callback(self._give_up, path)
-            sink = make(path)
-            undo.pop_all()
-        return sink
+        def free() -> Path:
+            with self._naming:
+                return name(taken=self._paths)
 
-    def _give_up(self, path: Path) -> None:
-        self._paths.discard(path)
-        if all(path != named for _, named, *_ in written(self.config)) and has_nothing(path):
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
+        return _opened(make, free, self._paths, {one.path for one in written(self.config)})
 
     def _recorder_settings(self, info: Info) -> RecorderSettings:
         config = self.config
