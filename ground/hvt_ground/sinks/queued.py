@@ -61,7 +61,7 @@ _SMALL_BYTES = 512
 _TRACK_BYTES = 64
 """Size of each track of an overlay."""
 BEHIND_S = 10.0
-"""The first delay of a sink that is told; then twice that, and so on."""
+"""The first delay of a sink that is told; then twice that, and so on, until it is less than half of this again."""
 _POLL_S = 0.2
 _AT_ONCE = threading.Event()
 _AT_ONCE.set()
@@ -266,6 +266,8 @@ class QueuedSink(Generic[T]):
         if (behind_s := time.monotonic() - came_s) >= self._behind_s:
             self._behind_s = 2 * behind_s
             _log.warning("%s is too slow: it is %d s behind, which a kill would lose", self.part, behind_s)
+        elif behind_s < BEHIND_S / 2:
+            self._behind_s = BEHIND_S
         return item, skipped
 
     def _give_receipts(self) -> None:

@@ -2,11 +2,13 @@
 
 import os
 import signal
+import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -77,6 +79,27 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(pipe, failures, caplog, mon
     assert lines == ["a", *["x" * 100] * 4096], "what was taken is written, in whole lines"
     assert "tracks table is too slow: it is 0 s behind, which a kill would lose" in caplog.messages
     assert failures.parts == (), "slow is not broken"
+
+
+def test_one_that_had_caught_up_is_told_of_again_however_late_it_was_before(failures, caplog, monkeypatch):
+    """After a minute that a card once took, half a minute of a recording that a kill would lose went untold."""
+    now_s, goes_on = [0.0], threading.Semaphore(0)
+    monkeypatch.setattr(queued, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+
+    class Slow(SinkWriter[float]):
+        def log(self, item: float) -> None:
+            goes_on.acquire()
+            now_s[0] += item
+
+    sink = QueuedSink("tracks table", Slow, failures=failures)
+    for late_s in (60.0, 30.0):
+        for takes_s in (late_s, 0.0, 0.0):
+            sink.log(takes_s)
+        goes_on.release(3)
+        eventually(lambda: sink.idle, what="it has caught up")
+    sink.close()
+    said = [one for one in caplog.messages if "tracks table is too slow" in one]
+    assert [one.split()[7] for one in said] == ["60", "30"]
 
 
 def test_a_disk_that_hangs_is_said_until_it_answers(pipe, failures, monkeypatch):
