@@ -294,12 +294,22 @@ class Pacer:
         self._reports = True
         self._started_ns: int | None = None
         """When the first keyframe was sent since a subscriber is there."""
+        self._began_ns: int | None = None
+        """When the first ground that reports was there."""
         self.ignored = 0
         """Reports ignored as old, of another receiver, of one without video, or naming a message never sent."""
 
     @property
     def rate_bps(self) -> int:
         return self._controller.rate_bps
+
+    @property
+    def most_bps(self) -> int:
+        """The total that the budget allows at this rate.
+
+        As a flight begins it is the whole: frames of the full rate, for which nobody listened, still fill its window.
+        """
+        return self._controller.ceiling_bps if self._controller.begins else self._controller.rate_bps
 
     @property
     def steady_bps(self) -> int:
@@ -419,13 +429,13 @@ class Pacer:
         True where the link has just come back, or messages in flight seem lost: the video needs a keyframe to go on.
         """
         with self._lock:
-            before, reported = self._linked, self._linked and self._reports
-            self._linked, self._reports = there, reports
+            before, self._linked, self._reports = self._linked, there, reports
             if there and not before:
                 self._started_ns, self._progress_ns = None, now_ns
-            if there and reports and not reported:
+            if there and reports and self._began_ns is None:
+                self._began_ns = now_ns
                 self._controller.begin()
-            elif self._started_ns is not None and now_ns - self._started_ns >= _FORGET_NS:
+            if self._began_ns is not None and now_ns - self._began_ns >= _FORGET_NS:
                 self._controller.trust()
             if before and not there:
                 self._flight.clear()

@@ -54,8 +54,12 @@ _PLATEAU_NS = 2_600 * _MS
 """Time of the growth back to the rate of the last breakdown."""
 _BEYOND_PER_S3 = 0.008
 """Growth beyond it, as a share of that rate, by the third power of the seconds."""
-_BEGIN_SHARE = 8
+_BEGIN_SHARE = 4
 """A flight begins at this part of the ceiling: a thin link has carried its first second in two."""
+_BEGIN_NS = SECOND_NS
+"""Time of the growth from there to the ceiling on a good link: longer, and each flight would begin with poor pictures."""
+_LEAST_STEP = 1.05
+"""Growth with each report then, however little there is to send: a dark scene or few stills prove no rate."""
 _SUSTAINED = 0.9
 """Messages that came no more slowly than this part of the pace at which they were sent found no queue."""
 _RESUME_NS = 3 * SECOND_NS
@@ -186,7 +190,7 @@ class RateController:
 
     def __init__(self, *, ceiling_bps: int, floor_bps: int) -> None:
         assert 0 < floor_bps <= ceiling_bps
-        self._ceiling_bps, self._floor_bps = ceiling_bps, floor_bps
+        self.ceiling_bps, self._floor_bps = ceiling_bps, floor_bps
         self._rate = float(ceiling_bps)
         self._least = LeastDelay()
         self._base_ns: int | None = None
@@ -209,25 +213,27 @@ class RateController:
 
     @property
     def rate_bps(self) -> int:
-        return round(min(self._ceiling_bps, max(self._floor_bps, self._rate)))
+        return round(min(self.ceiling_bps, max(self._floor_bps, self._rate)))
 
     @property
     def steady_bps(self) -> int:
         """The rate that is likely to last, for slow followers: near the last breakdown, a little below it."""
-        if self.at_ceiling or self._rate > 1.15 * self._cubic_max:
+        if self.at_ceiling or self.begins or self._rate > 1.15 * self._cubic_max:
             return self.rate_bps
         return min(self.rate_bps, max(self._floor_bps, round(0.9 * self._cubic_max)))
 
     @property
     def at_ceiling(self) -> bool:
-        return self._rate >= self._ceiling_bps
+        return self._rate >= self.ceiling_bps
 
     def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
         """Set another ceiling. A rate at the old ceiling moves to the new one; a lower rate grows as before."""
         if self.at_ceiling or self._rate > ceiling_bps:
             self._rate = self._cubic_max = float(ceiling_bps)
+        elif self._cubic_max >= self.ceiling_bps:
+            self._cubic_max = float(ceiling_bps)
         self._floor_bps = min(ceiling_bps, self._floor_bps if floor_bps is None else floor_bps)
-        self._ceiling_bps = ceiling_bps
+        self.ceiling_bps = ceiling_bps
 
     def on_progress(self, progress: Progress) -> None:
         """Process one report that names a message for the first time."""
@@ -251,14 +257,20 @@ class RateController:
         elif excess_ns < limit_ns // 2:
             self._grow(step_ns // 2 if self._losses.share > _SOME_LOSS else step_ns)
 
+    @property
+    def begins(self) -> bool:
+        """It is on its way up from `begin`, and nothing has held it yet."""
+        return self._plateau_ns == _BEGIN_NS and self._curve_ns < _BEGIN_NS
+
     def begin(self) -> None:
         """Nothing is known of the link: the rate begins low, and nears the former one as fast as messages come."""
-        self._climb_from(min(self._rate, max(self._floor_bps, self._ceiling_bps / _BEGIN_SHARE)))
+        lowest = max(self._floor_bps, self.ceiling_bps / _BEGIN_SHARE)
+        self._climb_from(min(self._rate, lowest), plateau_ns=_BEGIN_NS)
 
     def trust(self) -> None:
         """Nobody has reported anything, ever, and nobody will: the rate is the ceiling."""
         if self._last_ns is None:
-            self._rate = float(self._ceiling_bps)
+            self._rate = float(self.ceiling_bps)
 
     def on_silence(self, now_ns: int) -> None:
         """Reports have stopped: the rate falls to the floor. When they return it nears the former rate quickly."""
@@ -266,15 +278,15 @@ class RateController:
             self._silent = True
             if self._curve_ns >= self._plateau_ns:  # else it is still on its way back
                 self._cubic_max = self._rate
-            self._climb_from(self._floor_bps)
+            self._climb_from(self._floor_bps, plateau_ns=_RESUME_NS)
             self.backoffs += 1
             self._losses.clear()  # losses while a link is away are no property of it
             self._start_over(now_ns)
         self._last_ns = now_ns
 
-    def _climb_from(self, rate: float) -> None:
+    def _climb_from(self, rate: float, *, plateau_ns: int) -> None:
         self._rate = self._low = float(rate)
-        self._curve_ns, self._plateau_ns = 0, _RESUME_NS
+        self._curve_ns, self._plateau_ns = 0, plateau_ns
 
     def forget_path(self) -> None:
         """The receiver or the transport has changed: earlier delays say nothing."""
@@ -336,8 +348,7 @@ class RateController:
         # sent meanwhile would prove a higher rate but slowly.
         self.forget_path()
         self._cubic_max = max(self._rate, self._former_bps)
-        self._rate = self._low = max(self._rate, self._former_bps / _ROUTE_FALL)
-        self._curve_ns, self._plateau_ns = 0, _RESUME_NS
+        self._climb_from(max(self._rate, self._former_bps / _ROUTE_FALL), plateau_ns=_RESUME_NS)
 
     def _arriving_bps(self) -> float:
         # The arrival rate while the queue stood: the link's capacity.
@@ -362,7 +373,7 @@ class RateController:
 
     def _grow(self, step_ns: int) -> None:
         if self.at_ceiling:
-            self._rate = float(self._ceiling_bps)
+            self._rate = float(self.ceiling_bps)
             return
         curve_ns = self._curve_ns + step_ns
         wanted = self._on_curve(curve_ns)
@@ -371,7 +382,7 @@ class RateController:
         proven = max(self._lately_proven_bps(), min(self._cubic_max, self._delivery_bps()))
         if wanted <= proven:
             self._curve_ns = curve_ns
-        self._rate = min(float(self._ceiling_bps), max(self._rate, min(wanted, proven)))
+        self._rate = min(float(self.ceiling_bps), max(self._rate, min(wanted, proven)))
 
     def _on_curve(self, curve_ns: int) -> float:
         if curve_ns < self._plateau_ns:
@@ -394,11 +405,13 @@ class RateController:
         span_ns = last.arrived_ns - first.arrived_ns
         if span_ns < SECOND_NS // 2:
             return self._rate
-        if self._plateau_ns != _RESUME_NS or self._curve_ns >= self._plateau_ns:
-            return 2 * _arrival_bps(first, last)
+        arrival_bps = _arrival_bps(first, last)
+        if self._plateau_ns not in (_BEGIN_NS, _RESUME_NS) or self._curve_ns >= self._plateau_ns:
+            return 2 * arrival_bps
         # On the way up the least delay may itself be that of a queue, and show no excess.
-        sustained = last.sent_ns - first.sent_ns >= _SUSTAINED * span_ns
-        return (3 if sustained else 1) * _arrival_bps(first, last)
+        if last.sent_ns - first.sent_ns < _SUSTAINED * span_ns:
+            return arrival_bps
+        return max(3 * arrival_bps, _LEAST_STEP * self._rate if self.begins else 0)
 
 
 def _arrival_bps(first: Progress, last: Progress) -> float:

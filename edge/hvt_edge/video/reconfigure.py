@@ -96,7 +96,7 @@ class EncoderReconfiguration:
         """Hold the budget to the link's rate; True where the base should be opened anew, which needs a keyframe."""
         if self.pacer is None:
             return False
-        self._allow(self.pacer.rate_bps, now_ns)
+        self._allow(self.pacer.most_bps, now_ns)
         wanted_bps = self._base_of(self.pacer.steady_bps)
         return self._trigger.wants(
             wanted_bps, self.operating.now.base_bps, at_ceiling=self.pacer.at_ceiling, now_ns=now_ns
@@ -180,7 +180,7 @@ class EncoderReconfiguration:
             return None
         self._trigger.done(now_ns)
         rates = Rates(max(base_bps, pacer.steady_bps), base_bps, decimation)
-        return self._open(rates, total_bps=pacer.rate_bps, now_ns=now_ns)
+        return self._open(rates, total_bps=pacer.most_bps, now_ns=now_ns)
 
     def _open(self, rates: Rates, *, total_bps: int, now_ns: int) -> Encoder:
         self.count += 1

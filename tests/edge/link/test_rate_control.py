@@ -48,7 +48,7 @@ def progress(sent_ns: int, arrived_bytes: float, *, delay_ns: int = 20 * MS, **c
 @pytest.mark.parametrize(
     ("found_s", "held", "more"),
     [
-        (3, 0, {}),
+        (1.5, 0, {}),
         (3, 0, {"method": "M5", "video_share": 0.6}),  # where little is sent: there are no stills
         (4, 0, {"late_s": lambda second: 0.0 if second % 0.5 < 0.1 else None}),  # where little arrives
         (6, 10, {"way_s": lambda _second: 0.6}),  # of 450, while the round trip is not known yet
@@ -71,12 +71,12 @@ def test_a_steady_link_above_the_budget_is_found_within_seconds_and_kept(found_s
 def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps):
     """A pilot with a thin radio who forgot ``--budget`` would see the picture of ten seconds ago, or none at all."""
     flight = flown(40, (0, 1e3 * kbps), size=(1280, 720), way_s=lambda _second: 0.3)
-    assert max(flight.delays_between(0, 40)) < 2.5
+    assert max(flight.delays_between(0, 40)) < 3.5
     assert flight.longest_hole(0, 40) < 2
 
 
 @pytest.mark.parametrize(
-    ("budget", "steps"), [(5_000_000, [(0, 4e4)]), (800_000, [(0, 6e4), (20, 0), (40, 6e4)])]
+    ("budget", "steps"), [(2_000_000, [(0, 4e4)]), (800_000, [(0, 6e4), (20, 0), (40, 6e4)])]
 )
 def test_a_queue_of_many_seconds_is_emptied_and_taken_for_no_longer_route(budget, steps):
     """Below the floor each picture would be half a minute old for the whole flight, and the next older still."""
@@ -183,7 +183,7 @@ def test_a_link_below_the_budget_is_filled_without_oscillation():
     rates = flight.rate_between(20, 60)
     assert min(rates) > 150_000
     assert max(rates) < 370_000
-    assert flight.carried_bps(20, 60) > 0.82 * 200_000
+    assert flight.carried_bps(20, 60) > 0.8 * 200_000
     assert max(flight.delays_between(20, 60)) < 0.6
     assert len([second for second in flight.opened if second > 20]) <= 12
     falls = sum(1 for a, b in pairwise(rates) if b < a)
@@ -417,7 +417,7 @@ def test_a_ground_that_never_reports_gets_the_whole_budget_in_the_end():
         pacer.link(True, now_ns=second * S)
         rates.append(pacer.rate_bps)
         pacer.sent_base(second, 5_000, now_ns=second * S, keyframe=True)
-    assert rates == [100_000] * 15 + [800_000] * 5
+    assert rates == [200_000] * 15 + [800_000] * 5
 
 
 def test_a_receiver_that_has_left_is_forgotten_and_the_rate_stays_at_its_least():
