@@ -168,26 +168,27 @@ class Entity:
     last_frame: int = -1
     """The newest frame at which any source observed it."""
 
-    def is_report_live(self, frame_index: int, *, patience: int, reach: int) -> bool:
-        """Whether the edge's knowledge of it, or a still's, holds at this frame, and says where it is."""
-        seen = self.reported
-        if seen is None or frame_index - seen.frame_index > patience:
+    def is_report_live(self, frame_index: int, *, patience: int) -> bool:
+        """Whether the edge's knowledge of it, or a still's, holds at this frame."""
+        if self.reported is None or frame_index - self.reported.frame_index > patience:
             return False
-        if self.edge_id is None:
-            return True
-        unknown = frame_index - seen.frame_index - reach
-        return self.missed < MISSED_STEPS and (unknown <= 0 or seen.stays(unknown))
+        return self.edge_id is None or self.missed < MISSED_STEPS
 
     def origin(
         self, own_ids: Container[int | None], frame_index: int, *, patience: int, reach: int
     ) -> Origin | None:
-        """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more)."""
-        observed = self.is_report_live(frame_index, patience=patience, reach=reach)
+        """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more), or where it may be
+        anywhere by now: the edge's box is more than ``reach`` frames old, and it moves, or nobody knows.
+        """
+        observed = self.is_report_live(frame_index, patience=patience)
         if self.own_id is not None and self.own_id in own_ids:
             return "edge+base" if observed and self.edge_id is not None else "base"
-        if not observed:
+        if not observed or self.reported is None:
             return None
-        return "still" if self.edge_id is None else "edge"
+        if self.edge_id is None:
+            return "still"
+        unknown = frame_index - self.reported.frame_index - reach
+        return "edge" if unknown <= 0 or self.reported.stays(unknown) else None
 
     def part_from_own(self) -> None:
         """Forget our track, which is another object."""

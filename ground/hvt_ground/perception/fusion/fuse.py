@@ -355,7 +355,7 @@ class Fusion:
             self._entities.remove(old)
 
     def _is_edge_only(self, entity: Entity, frame_index: int) -> bool:
-        return entity.is_report_live(frame_index, patience=self._rules.patience, reach=self._rules.reach)
+        return entity.is_report_live(frame_index, patience=self._rules.patience)
 
     def _reported_boxes(self, entities: Sequence[Entity], frame_index: int) -> npt.NDArray[np.float64]:
         return reported_boxes(entities, frame_index, path=self.path, reach=self._rules.reach)

@@ -115,6 +115,8 @@ FIND = "own 0 1=A; found 0 A+3 B; own 1 1=A"
         ("own 0; step 0 70=A; step 5 70=A+20; own 20", "1=edge@A+80"),
         ("own 0; step 0 70=A; step 5 70=A+20; own 25", ""),
         ("own 0; step 0 70=A; step 5 70=A+20; own 25; step 25 70=A+100; own 26", "1=edge@A+104"),
+        # Between rare steps of the edge the class would flip.
+        ("own 0 1=A; step 0 70=A; own 18 1=A+72", "1=edge+base"),
         # Cars that have driven away, or the list of an edge that has gone silent, would stay on the screen.
         ("own 0; step 0 70=A 71=B; step 5 71=B; own 6", "1=edge 2=edge"),
         ("own 0; step 0 70=A 71=B; step 5 71=B; step 10 71=B; own 11", "2=edge@B"),
