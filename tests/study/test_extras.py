@@ -65,7 +65,9 @@ def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, ins
     found = done(tmp_path, module, words.split(), without)
     assert found.returncode == 2, found.stderr
     assert f"pip install {install}".replace("hvt[", "'hvt[").replace("]", "]'") in found.stderr
-    assert len([one for one in found.stderr.splitlines() if not one.startswith("runs: ")]) == 1  # the progress
+    assert (
+        len([one for one in found.stderr.splitlines() if not one.startswith("runs: ")]) == 1
+    )  # the progress
 
 
 def test_what_needs_no_extra_works_without_one(tmp_path):

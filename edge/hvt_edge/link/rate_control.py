@@ -57,7 +57,7 @@ _BEYOND_PER_S3 = 0.008
 _BEGIN_SHARE = 4
 """A flight begins at this part of the ceiling: a thin link has carried its first second in two."""
 _BEGIN_NS = SECOND_NS
-"""Time of the growth from there to the ceiling on a good link: longer, and each flight would begin with poor pictures."""
+"""Time of the growth from there to the ceiling, on a good link: each flight begins with the poorer pictures."""
 _LEAST_STEP = 1.05
 """Growth with each report then, however little there is to send: a dark scene or few stills prove no rate."""
 _SUSTAINED = 0.9

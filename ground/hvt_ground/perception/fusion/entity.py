@@ -177,8 +177,9 @@ class Entity:
     def origin(
         self, own_ids: Container[int | None], frame_index: int, *, patience: int, reach: int
     ) -> Origin | None:
-        """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more), or where it may be
-        anywhere by now: the edge's box is more than ``reach`` frames old, and it moves, or nobody knows.
+        """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more), or if lost from sight.
+
+        That is one that only the edge has seen, more than ``reach`` frames ago, and that moves or may move.
         """
         observed = self.is_report_live(frame_index, patience=patience)
         if self.own_id is not None and self.own_id in own_ids:
