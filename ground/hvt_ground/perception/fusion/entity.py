@@ -177,7 +177,7 @@ class Entity:
     def origin(
         self, own_ids: Container[int | None], frame_index: int, *, patience: int, reach: int
     ) -> Origin | None:
-        """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more), or if it may be anywhere.
+        """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more), or if it has moved off.
 
         That is one that only the edge has seen, more than ``reach`` frames ago, and that moves or may move.
         """
