@@ -3,13 +3,21 @@
 A program that wants the pictures, tracks and stills itself uses `listen`, see docs/library.md.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from hvt_library.ground import Listening
+
+__all__ = ["listen"]
 
 
-def __getattr__(name: str) -> Any:
-    """Load `listen`, of an extra, only when it is used."""
-    if name == "listen":
-        from hvt_common.runtime.plug_ins import library_part  # noqa: PLC0415
+def listen(**settings: object) -> Listening:
+    """A ground that gives its events to this program, with the settings of ``hvt-ground``.
 
-        return library_part("ground", name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    Raises `UserError` where a setting is unknown or wrong, or the extra is not installed.
+    """
+    from hvt_common.runtime.plug_ins import library_part  # noqa: PLC0415 - the ground itself needs no library
+
+    return cast("Listening", library_part("ground", "listen")(**settings))

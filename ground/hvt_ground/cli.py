@@ -59,10 +59,8 @@ def _run(argv: Sequence[str] | None) -> int:
     if words and not words[0].startswith("-"):
         entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
         if entry is not None:
-            if words[0] in _BROUGHT:
-                with needs_extra("'hvt[ground]'"):
-                    entry.load()
-            return int(loaded(entry, lambda run: run, what="command")(words[1:]))
+            install = "'hvt[ground]'" if words[0] in _BROUGHT else None
+            return int(loaded(entry, lambda run: run, what="command", install=install)(words[1:]))
         if words[0] in _BROUGHT:
             raise UserError(
                 f"hvt-ground {words[0]} is of an extra that is not installed: pip install 'hvt[ground]'"

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import hvt_edge.cli
+import hvt_ground
 from hvt_archive.exports.tables import LineFile
 from hvt_archive.replay.message_log import MessageLog
 from hvt_common.config import load
@@ -22,6 +23,7 @@ from hvt_common.runtime.plug_ins import health_server
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_edge.source.opening import open_source
 from hvt_edge.video.encoder import check_encoder, encoder_names
 from hvt_edge.wiring.storing import open_local_copy
 from hvt_gateways.mcap.file import McapFile
@@ -135,12 +137,33 @@ def test_an_encoder_of_hardware_without_its_extra_names_it(monkeypatch):
     assert {"hevc_nvenc", "passthrough"} < {*brought}
     monkeypatch.setattr("hvt_edge.video.encoder.installed", lambda _group: {})
     monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
-    with pytest.raises(UserError, match=r"^hvt_edge.open is of an extra .*: pip install 'hvt\[edge\]'$"):
-        assert hvt_edge.open(budget="300kbps")
     for name in brought:
         says = rf"^--encoder {name} is of an extra that is not installed: pip install 'hvt\[edge\]'$"
         with pytest.raises(UserError, match=says):
             check_encoder(name)
+
+
+@pytest.mark.parametrize(
+    ("side", "part"), [("edge", lambda: hvt_edge.open), ("ground", lambda: hvt_ground.listen)]
+)
+def test_a_side_in_another_program_without_its_extra_names_it(side, part, monkeypatch):
+    """Whoever only looked what the package has, or imported the name, met the error of who uses it."""
+    for found, says in (
+        ({}, f"^hvt_{side}.{part().__name__} is of an extra that is not installed: pip install"),
+        (entry(side, "absent_sdk:run"), "^the package 'absent_sdk' is missing: pip install"),
+    ):
+        monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group, found=found: found)
+        with pytest.raises(UserError, match=rf"{says} 'hvt\[{side}\]'$"):
+            part()(budget="300kbps")
+
+
+@pytest.mark.parametrize("spec", ["demo", "demo:codes,8k"])
+def test_the_drawn_demo_without_its_extra_names_it(spec, monkeypatch):
+    """Install hvt whole, it said, to whom pip answers that it is installed."""
+    monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
+    says = rf"^--source {spec} is of an extra that is not installed: pip install 'hvt\[edge\]'$"
+    with pytest.raises(UserError, match=says):
+        open_source(spec, size=(640, 360), fps=15)
 
 
 def test_the_names_of_heads_are_those_that_the_library_reads():

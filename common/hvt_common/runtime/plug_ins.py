@@ -1,7 +1,7 @@
 """Parts that other packages install behind an entry point: found by name, loaded when named, never a traceback."""
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
@@ -39,10 +39,15 @@ def the_one(group: str, name: str, *, what: str, built_in: bool) -> EntryPoint |
     return found[0] if found else None
 
 
-def loaded(entry: EntryPoint, make: Callable[[Any], Any], *, what: str) -> Any:
-    """The result of ``make`` for the entry's object; `UserError` for whatever foreign code raises."""
+def loaded(entry: EntryPoint, make: Callable[[Any], Any], *, what: str, install: str | None = None) -> Any:
+    """The result of ``make`` for the entry's object; `UserError` for whatever foreign code raises.
+
+    Where a package is missing that the object needs, it names ``install``, such as ``'hvt[ground]'``.
+    """
     try:
-        return make(entry.load())
+        with needs_extra(install) if install else nullcontext():
+            part = entry.load()
+        return make(part)
     except UserError:  # its own sentence
         raise
     except foreign() as error:
@@ -61,7 +66,7 @@ def library_part(side: str, name: str) -> Any:
     entry = the_one("hvt.library", side, what="library", built_in=False)
     if entry is None:
         raise UserError(f"hvt_{side}.{name} is of an extra that is not installed: pip install 'hvt[{side}]'")
-    return loaded(entry, lambda found: found, what="library")
+    return loaded(entry, lambda found: found, what="library", install=f"'hvt[{side}]'")
 
 
 _GROUP = "hvt.health"
@@ -86,7 +91,7 @@ def health_server(
     entry = the_one(_GROUP, side, what="health server", built_in=False)
     if entry is None:
         raise UserError("--metrics is of an extra that is not installed: pip install 'hvt[metrics]'")
-    with needs_extra("'hvt[metrics]'"):  # who is not watched needs no Prometheus
-        serve = entry.load()
+    # Only now: who is not watched needs no Prometheus.
+    serve = loaded(entry, lambda found: found, what="health server", install="'hvt[metrics]'")
     server = serve(address, newest, clock=clock, stuck_s=stuck_s, failures=failures, lacks=lacks)
     return cast("AbstractContextManager[object]", server)

@@ -102,7 +102,7 @@ def is_demo(spec: str) -> bool:
 def _drawn(spec: str, settings: SourceSettings, *, seed: int) -> Source:
     entry = the_one("hvt.scenes", "demo", what="scene", built_in=False)
     if entry is None:
-        raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
+        raise UserError(f"--source {spec:.200} is of an extra that is not installed: pip install 'hvt[edge]'")
     return cast("Source", loaded(entry, lambda draw: draw(spec, settings, seed=seed), what="scene"))
 
 
