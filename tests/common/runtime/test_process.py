@@ -241,10 +241,11 @@ def test_a_library_that_lowers_its_own_workers_gets_them_back():
         worker.start()
     lowered.wait()
     try:
-        workers.raise_priority()
         own = niceness(threading.get_native_id())
         assert worker.native_id is not None
         assert other.native_id is not None
+        assert niceness(worker.native_id) == max(own, 11), "as the first is"
+        workers.raise_priority()
         assert niceness(worker.native_id) == (own if may_raise_priority() else max(own, 11))
         assert niceness(other.native_id) == max(own, 11), "it was there before"
     finally:

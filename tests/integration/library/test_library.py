@@ -129,6 +129,19 @@ def test_what_is_wrong_is_raised_where_the_program_can_see_it(tmp_path, monkeypa
         next(ground)
 
 
+def test_a_flight_that_fails_keeps_its_summary(monkeypatch):
+    """What was sent before the disk was gone would be known to nobody."""
+
+    def fail(_edge):
+        raise FlightError("the disk is gone", summary={"frames": 3})
+
+    monkeypatch.setattr(library.Edge, "run", fail)
+    edge = hvt_edge.open(connect="tcp/127.0.0.1:9", detector="motion")
+    with pytest.raises(FlightError, match="the disk is gone"):
+        edge.close()
+    assert edge.summary == {"frames": 3}
+
+
 def test_a_program_that_pushes_again_after_a_pause_is_sent_at_once(monkeypatch, caplog):
     """Its video would stay dark for up to eight seconds after it is there again, as after a camera that is gone."""
     monkeypatch.setattr(library, "PATIENCE_S", 0.01)
@@ -186,11 +199,12 @@ def test_a_program_ends_while_zenoh_calls(library):
 
 
 def test_a_program_that_forgets_to_close_ends():
-    """It would abort, or hang."""
+    """It would abort, or hang, or say no goodbye."""
     program = """
-import sys, time
+import atexit, sys, time
 import numpy as np
 import hvt_edge
+atexit.register(lambda: print("frames" in edge.summary))  # the first, and so the last of all
 edge = hvt_edge.open(listen=sys.argv[1], detector="motion", size="320x192")
 edge.push(np.zeros((192, 320, 3), np.uint8))
 time.sleep(1)
@@ -199,7 +213,7 @@ time.sleep(1)
     done = subprocess.run(
         [sys.executable, "-c", program, endpoint], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
+    assert (done.returncode, done.stdout) == (0, "True\n"), done.stderr
 
 
 def test_large_pictures_that_nobody_takes_have_a_bound_in_bytes(monkeypatch):

@@ -101,6 +101,7 @@ def test_what_is_damaged_is_left_out_up_to_the_next_keyframe(tmp_path, caplog):
         ("demo", None, "is the drawn demo, and --encoder passthrough takes a video file or a stream"),
         ("/dev/video0", None, "is a device, and --encoder passthrough takes a video file or a stream"),
         ("/dev/" + "x" * 300, None, "is a device, and"),
+        ("x" * 300, None, "does not exist"),
         (".", None, "is a folder, and --encoder passthrough takes a video file or a stream"),
     ],
 )
@@ -109,7 +110,8 @@ def test_what_no_ground_could_show_is_refused(tmp_path, made, size, says):
     spec = made if isinstance(made, str) else write_clip(tmp_path / "a.mp4", **made)
     with pytest.raises(UserError, match=says) as caught:
         coded(spec, size=size)
-    assert "re-encode it with --encoder x265" in str(caught.value)
+    advised = "re-encode it with --encoder x265" in str(caught.value)
+    assert advised == (says != "does not exist")
 
 
 @pytest.mark.parametrize(
