@@ -10,13 +10,14 @@ import itertools
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
 
-from hvt_codecs.passthrough.camera import Camera, Passthrough
+from hvt_codecs.passthrough.camera import Camera
 from hvt_codecs.passthrough.stream import CameraStream, SeenUnit
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
@@ -35,14 +36,14 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder import (
     Encoder,
-    EncoderSettings,
     encoder_settings,
     keyframe_floor_bytes,
     minimum_bps,
 )
+from hvt_edge.video.reconfigure import OpenEncoder, encoder_opener
 from hvt_edge.video.stage import Action
 from hvt_edge.wiring.link import make_budget, make_pacer
-from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, make_frame_skip
+from hvt_edge.wiring.video import encoder_plan, first_decimation, first_rates, make_encoder, make_frame_skip
 from rigs.kept import INFO
 from rigs.messages import feedback
 from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
@@ -228,12 +229,16 @@ class LiveFlight:
             wait_until=self._wait_until,
             pacer=self.pacer,
         )
+        open_encoder: OpenEncoder = partial(self._opened, size)
+        if self.camera:
+            open_encoder = encoder_opener(encoder_plan(config, size), self.operating)
+        encoder = open_encoder(first_rates(config, decimation))
         reconfiguration = make_reconfiguration(
             self.operating,
             config,
             size,
             self.transmitter,
-            open_encoder=lambda rates: self._opened(size, rates),
+            open_encoder=open_encoder,
             pacer=self.pacer,
         )
         self.backlog = None
@@ -264,7 +269,7 @@ class LiveFlight:
         self.stage: Any
         if self.surveyed is not None:
             self.stage = self.surveyed.make_stage(
-                Passthrough(EncoderSettings(size, fps=config.nominal_fps, bitrate_bps=1)),
+                encoder,
                 reconfiguration,
                 keyframes=self.keyframes,
                 transmitter=self.transmitter,
@@ -274,7 +279,7 @@ class LiveFlight:
             )
             return
         self.stage = make_base_stage(
-            self._opened(size, first_rates(config, decimation)),
+            encoder,
             self.transmitter,
             keyframes=self.keyframes,
             first_keyframe_bytes=config.base_bps // 40,

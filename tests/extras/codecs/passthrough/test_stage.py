@@ -30,7 +30,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.operating import Keyframes, KeyframeSettings, base_rate_bps
-from hvt_edge.video.encoder import EncoderSettings, open_encoder
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.qualification import allowed, line_bytes
 from media.clips import START_NS, hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, write_clip
@@ -244,11 +244,6 @@ def test_a_ground_that_asks_for_a_keyframe_is_told_when_one_comes(burst):
     assert not rig.keyframes.due(rig.now_ns)
     assert rig.keyframes.sent == 1
     assert rig.ledger.messages(Account.BASE) == 5
-
-
-def test_a_change_of_the_rate_closes_nothing_that_the_camera_needs():
-    """The flight would end when the link's rate first changes: its stage keeps the encoder that it began with."""
-    assert not hasattr(open_encoder("passthrough", EncoderSettings(SIZE, fps=15, bitrate_bps=1)), "close")
 
 
 def test_an_outage_is_stored_from_keyframe_to_keyframe(tmp_path):
