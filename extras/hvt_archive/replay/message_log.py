@@ -117,7 +117,11 @@ def _is_info(payload: bytes) -> bool:
 def _created(path: Path) -> BinaryIO:
     with telling(f"message log {path} cannot be created: "):
         file = os.fdopen(created(path), "wb", buffering=0)
-        file.write(_MAGIC)
+        try:
+            file.write(_MAGIC)
+        except OSError:
+            file.close()  # or its lock would be in the way of the next try
+            raise
         return file
 
 

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from hvt_archive.replay.message_log import MessageLog, read_log
 from hvt_common.errors import UserError
+from hvt_common.files import takes_lock
 from hvt_common.transport.inbox import Received
-from programs.small_disk import small_disk
+from programs.small_disk import files_at_most, small_disk
 from rigs.messages import INFO
 
 MOST_BYTES = 10**9
@@ -144,8 +145,13 @@ def test_what_is_no_log_is_said(tmp_path):
         list(read_log(pipe))
 
 
-def test_a_full_disk_leaves_whole_records(tmp_path):
-    """What was kept so far would be lost with what found no room."""
+def test_a_full_disk_leaves_whole_records_and_no_lock(tmp_path):
+    """What was kept so far would be lost with what found no room; or the next try call it another program's file."""
+    path = tmp_path / "refused.hvtlog"
+    with files_at_most(0), pytest.raises(UserError, match="cannot be created: File too large") as refused:
+        MessageLog(path, most_bytes=MOST_BYTES)
+    with path.open() as file:
+        assert takes_lock(file.fileno()), refused
     with small_disk(tmp_path / "small", size="8k") as disk:
         sink = MessageLog(disk / "flight.hvtlog", most_bytes=MOST_BYTES)
         endless = itertools.cycle(MESSAGES)
