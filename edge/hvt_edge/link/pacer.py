@@ -304,12 +304,16 @@ class Pacer:
         return self._controller.rate_bps
 
     @property
+    def begins(self) -> bool:
+        return self._controller.begins
+
+    @property
     def most_bps(self) -> int:
         """The total that the budget allows at this rate.
 
         As a flight begins it is the whole: frames of the full rate, for which nobody listened, still fill its window.
         """
-        return self._controller.ceiling_bps if self._controller.begins else self._controller.rate_bps
+        return self._controller.ceiling_bps if self.begins else self._controller.rate_bps
 
     @property
     def steady_bps(self) -> int:

@@ -54,10 +54,12 @@ _PLATEAU_NS = 2_600 * _MS
 """Time of the growth back to the rate of the last breakdown."""
 _BEYOND_PER_S3 = 0.008
 """Growth beyond it, as a share of that rate, by the third power of the seconds."""
-_BEGIN_SHARE = 4
-"""A flight begins at this part of the ceiling: a thin link has carried its first second in two."""
+_BEGIN_SHARE = 2
+"""A flight begins at this part of the ceiling: half of what a thin link cannot carry is not sent, and few see it."""
 _BEGIN_NS = SECOND_NS
 """Time of the growth from there to the ceiling, on a good link: each flight begins with the poorer pictures."""
+_LONGEST_BEGIN_NS = 5 * SECOND_NS
+"""What has not found its rate by then, where delays vary, grows like any other."""
 _LEAST_STEP = 1.05
 """Growth with each report then, however little there is to send: a dark scene or few stills prove no rate."""
 _SUSTAINED = 0.9
@@ -204,6 +206,7 @@ class RateController:
         self._plateau_ns = _PLATEAU_NS
         self._curve_ns = 2**62
         """Time along the curve of growth; only time without signs of congestion counts."""
+        self._begin_left_ns = _LONGEST_BEGIN_NS
         self._last_ns: int | None = None
         self._silent = False
         self._losses = LossCount()
@@ -238,6 +241,7 @@ class RateController:
     def on_progress(self, progress: Progress) -> None:
         """Process one report that names a message for the first time."""
         step_ns = self._elapsed(progress.now_ns)
+        self._begin_left_ns -= step_ns
         excess_ns = self._excess(progress)
         if progress.sent_ns < self._judge_from_ns:
             return
@@ -260,7 +264,8 @@ class RateController:
     @property
     def begins(self) -> bool:
         """It is on its way up from `begin`, and nothing has held it yet."""
-        return self._plateau_ns == _BEGIN_NS and self._curve_ns < _BEGIN_NS
+        climbs = self._plateau_ns == _BEGIN_NS and self._curve_ns < _BEGIN_NS
+        return climbs and self._begin_left_ns > 0 and not self.at_ceiling
 
     def begin(self) -> None:
         """Nothing is known of the link: the rate begins low, and nears the former one as fast as messages come."""

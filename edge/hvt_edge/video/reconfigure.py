@@ -98,6 +98,8 @@ class EncoderReconfiguration:
             return False
         self._allow(self.pacer.most_bps, now_ns)
         wanted_bps = self._base_of(self.pacer.steady_bps)
+        if self.pacer.begins and wanted_bps >= self.operating.now.base_bps:
+            return False  # one keyframe at the rate that is found costs less than three on the way there
         return self._trigger.wants(
             wanted_bps, self.operating.now.base_bps, at_ceiling=self.pacer.at_ceiling, now_ns=now_ns
         )

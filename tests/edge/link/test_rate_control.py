@@ -67,16 +67,17 @@ def test_a_steady_link_above_the_budget_is_found_within_seconds_and_kept(found_s
     assert flight.held <= held
 
 
-@pytest.mark.parametrize("kbps", [60, 150, 300])
-def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps):
+@pytest.mark.parametrize(("kbps", "soon_s", "most_s"), [(60, 10, 8), (150, 5, 3), (300, 3, 1.5)])
+def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps, soon_s, most_s):
     """A pilot with a thin radio who forgot ``--budget`` would see the picture of ten seconds ago, or none at all."""
     flight = flown(40, (0, 1e3 * kbps), size=(1280, 720), way_s=lambda _second: 0.3)
-    assert max(flight.delays_between(0, 40)) < 3.5
+    assert max(flight.delays_between(0, 40)) < most_s
+    assert max(flight.delays_between(soon_s, 40)) < 2
     assert flight.longest_hole(0, 40) < 2
 
 
 @pytest.mark.parametrize(
-    ("budget", "steps"), [(2_000_000, [(0, 4e4)]), (800_000, [(0, 6e4), (20, 0), (40, 6e4)])]
+    ("budget", "steps"), [(1_400_000, [(0, 6e4)]), (800_000, [(0, 6e4), (20, 0), (40, 6e4)])]
 )
 def test_a_queue_of_many_seconds_is_emptied_and_taken_for_no_longer_route(budget, steps):
     """Below the floor each picture would be half a minute old for the whole flight, and the next older still."""
@@ -417,7 +418,7 @@ def test_a_ground_that_never_reports_gets_the_whole_budget_in_the_end():
         pacer.link(True, now_ns=second * S)
         rates.append(pacer.rate_bps)
         pacer.sent_base(second, 5_000, now_ns=second * S, keyframe=True)
-    assert rates == [200_000] * 15 + [800_000] * 5
+    assert rates == [400_000] * 15 + [800_000] * 5
 
 
 def test_a_receiver_that_has_left_is_forgotten_and_the_rate_stays_at_its_least():
