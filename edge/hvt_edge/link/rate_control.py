@@ -55,11 +55,11 @@ _PLATEAU_NS = 2_600 * _MS
 _BEYOND_PER_S3 = 0.008
 """Growth beyond it, as a share of that rate, by the third power of the seconds."""
 _BEGIN_SHARE = 2
-"""A flight begins at this part of the ceiling: half of what a thin link cannot carry is not sent, and few see it."""
+"""A flight begins at this part of the ceiling: a smaller one delays a thin link less, and all others show it."""
 _BEGIN_NS = SECOND_NS
 """Time of the growth from there to the ceiling, on a good link: each flight begins with the poorer pictures."""
 _LONGEST_BEGIN_NS = 5 * SECOND_NS
-"""What has not found its rate by then, where delays vary, grows like any other."""
+"""A rate that is not found by then, where delays vary, grows like any other."""
 _LEAST_STEP = 1.05
 """Growth with each report then, however little there is to send: a dark scene or few stills prove no rate."""
 _SUSTAINED = 0.9
