@@ -36,9 +36,9 @@ _GIVEN_UP_NS = SECOND_NS
 _SILENCE_NS = 2 * SECOND_NS
 _PROBE_NS = SECOND_NS
 """In silence one frame is sent in this time: a ground that has forgotten the session receives nothing else."""
-_START_NS, _START_HOLD_NS = SECOND_NS // 2, 2 * SECOND_NS
-"""Before the first report, frames go for half a second from a keyframe on, then none for two seconds: a thin link
-that is overrun at once leaves no room to query info. A ground that never reports gets every frame after that."""
+_START_NS, _START_HOLD_NS = SECOND_NS // 2, 8 * SECOND_NS
+"""Before the first report, frames go for half a second from a keyframe on, then one in `_PROBE_NS` for eight: a thin
+link that is overrun at once leaves no room to query info. A ground that never reports gets every frame after that."""
 _FORGET_NS = 15 * SECOND_NS
 """A receiver silent for this long has left, where Zenoh still has the link: its lease is shorter. Other subscribers
 get video at the least rate, since behind a router the link may be gone all the same."""
@@ -455,16 +455,17 @@ class Pacer:
     def admits_base(self, now_ns: int, *, coding_ns: int = 0) -> bool:
         """Whether a frame may be encoded now, and sent ``coding_ns`` later."""
         with self._lock:
+            # Stored frames have the former rate: they would delay live video when the link is back.
+            carries_ns = 8 * SECOND_NS * self._last_bytes // self.rate_bps
+            probes = now_ns - self._last_sent_ns >= max(_PROBE_NS, carries_ns)
             if self._reported_ns is None:
-                return self._may_start(now_ns)
+                return self._may_start(now_ns) or probes
             if now_ns - self._reported_ns > _FORGET_NS and self._linked:
                 self._leave()
                 return True
             self._give_up(now_ns, self._reported_ns)
             if now_ns - self._reported_ns > _SILENCE_NS:
-                # Stored frames have the former rate: they would delay live video when the link is back.
-                carries_ns = 8 * SECOND_NS * self._last_bytes // self.rate_bps
-                return now_ns - self._last_sent_ns >= max(_PROBE_NS, carries_ns)
+                return probes
             return self._is_open(now_ns, _MOST_BACKLOG_NS + coding_ns) or self._probes(now_ns)
 
     def holds(self, now_ns: int) -> bool:
@@ -477,6 +478,8 @@ class Pacer:
 
     def admits_still(self, now_ns: int) -> bool:
         with self._lock:
+            if self.begins:
+                return False  # video alone finds the rate: on a thin link stills would fill the queue
             if self._reported_ns is None:
                 return self._may_start(now_ns)
             return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)

@@ -54,7 +54,7 @@ _PLATEAU_NS = 2_600 * _MS
 """Time of the growth back to the rate of the last breakdown."""
 _BEYOND_PER_S3 = 0.008
 """Growth beyond it, as a share of that rate, by the third power of the seconds."""
-_BEGIN_SHARE = 2
+_BEGIN_SHARE = 4
 """A flight begins at this part of the ceiling: a smaller one delays a thin link less, and all others show it."""
 _BEGIN_NS = SECOND_NS
 """Time of the growth from there to the ceiling, on a good link: each flight begins with the poorer pictures."""
@@ -64,6 +64,8 @@ _LEAST_STEP = 1.05
 """Growth with each report then, however little there is to send: a dark scene or few stills prove no rate."""
 _SUSTAINED = 0.9
 """Messages that came no more slowly than this part of the pace at which they were sent found no queue."""
+_OUTRUN = 0.7
+"""Below this part of the pace they fill a queue: a flight that begins has found the link's rate."""
 _RESUME_NS = 3 * SECOND_NS
 """Time of the growth back to the former rate after the link was gone."""
 _MOST_LOSS = 0.12
@@ -249,7 +251,9 @@ class RateController:
         self._recent.append((progress, excess_ns))
         self._losses.add(progress.messages, progress.lost)
         limit_ns = self._limit_ns()
-        if excess_ns >= limit_ns // 2 and self._is_longer_route():
+        if self.begins and self._pace() < _OUTRUN:
+            self._back_off(progress, _BACKOFF * min(self._rate, self._lately_bps()))
+        elif excess_ns >= limit_ns // 2 and self._is_longer_route():
             self._take_longer_route()
         elif self._overused(limit_ns) and self._rate > self._floor_bps:
             self._back_off(progress, _BACKOFF * min(self._rate, self._arriving_bps()))
@@ -401,20 +405,35 @@ class RateController:
         last_ns = self._recent[-1][0].arrived_ns
         return max(one.delivery_bps for one, _ in self._recent if last_ns - one.arrived_ns <= SECOND_NS)
 
-    def _lately_proven_bps(self) -> float:
-        # A multiple of the arrival rate of about the last second; the present rate if that is not known yet.
+    def _lately(self) -> tuple[Progress, Progress] | None:
+        # The first and the last report of about the last second; None after less than half of one.
         last = first = self._recent[-1][0]
         for first, _ in reversed(self._recent):
             if last.arrived_ns - first.arrived_ns >= SECOND_NS:
                 break
-        span_ns = last.arrived_ns - first.arrived_ns
-        if span_ns < SECOND_NS // 2:
-            return self._rate
-        arrival_bps = _arrival_bps(first, last)
+        return (first, last) if last.arrived_ns - first.arrived_ns >= SECOND_NS // 2 else None
+
+    def _pace(self) -> float:
+        # The speed at which messages came, over that at which they were sent; 1 where nobody knows.
+        lately = self._lately()
+        if lately is None:
+            return 1.0
+        first, last = lately
+        return (last.sent_ns - first.sent_ns) / (last.arrived_ns - first.arrived_ns)
+
+    def _lately_bps(self) -> float:
+        lately = self._lately()
+        return self._rate if lately is None else _arrival_bps(*lately)
+
+    def _lately_proven_bps(self) -> float:
+        # A multiple of the arrival rate of about the last second; the present rate if that is not known yet.
+        arrival_bps = self._lately_bps()
+        if self._lately() is None:
+            return arrival_bps
         if self._plateau_ns not in (_BEGIN_NS, _RESUME_NS) or self._curve_ns >= self._plateau_ns:
             return 2 * arrival_bps
         # On the way up the least delay may itself be that of a queue, and show no excess.
-        if last.sent_ns - first.sent_ns < _SUSTAINED * span_ns:
+        if self._pace() < _SUSTAINED:
             return arrival_bps
         return max(3 * arrival_bps, _LEAST_STEP * self._rate if self.begins else 0)
 

@@ -26,6 +26,8 @@ from hvt_edge.video.x265 import BaseEncoder
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
+_FAR_MORE = 2.0
+"""Least growth of the base rate that is worth a keyframe while a flight begins."""
 _WORTH = 0.04
 """Least change of the base rate, as a share, at a keyframe that is due anyway."""
 
@@ -98,8 +100,8 @@ class EncoderReconfiguration:
             return False
         self._allow(self.pacer.most_bps, now_ns)
         wanted_bps = self._base_of(self.pacer.steady_bps)
-        if self.pacer.begins and wanted_bps >= self.operating.now.base_bps:
-            return False  # one keyframe at the rate that is found costs less than three on the way there
+        if self.pacer.begins and 1 <= wanted_bps / self.operating.now.base_bps < _FAR_MORE:
+            return False  # few keyframes on the way to the rate that is found cost less than many
         return self._trigger.wants(
             wanted_bps, self.operating.now.base_bps, at_ceiling=self.pacer.at_ceiling, now_ns=now_ns
         )

@@ -399,14 +399,14 @@ def test_the_start_waits_for_the_first_report():
     pacer = Pacer(controller())
     pacer.link(True, now_ns=0)
     admitted = []
-    for number in range(75):
+    for number in range(150):
         now_ns = number * S // 15
         if pacer.admits_base(now_ns):
             admitted.append(number)
             pacer.sent_base(len(admitted) - 1, 5_000, now_ns=now_ns, keyframe=number == 2)
-    # 0.5 s from the keyframe on, and after the wait who never reports is served all the same.
-    assert admitted == [*range(10), *range(40, 75)]
-    pacer.on_report(counted(feedback(base_sequence=10), now_ns=5 * S, first=True))
+    # 0.5 s from the keyframe on, one a second, and after the wait who never reports is served all the same.
+    assert admitted == [*range(10), *range(24, 130, 15), *range(130, 150)]
+    pacer.on_report(counted(feedback(base_sequence=10), now_ns=10 * S, first=True))
     assert pacer.ignored == 0
 
 
@@ -418,7 +418,7 @@ def test_a_ground_that_never_reports_gets_the_whole_budget_in_the_end():
         pacer.link(True, now_ns=second * S)
         rates.append(pacer.rate_bps)
         pacer.sent_base(second, 5_000, now_ns=second * S, keyframe=True)
-    assert rates == [400_000] * 15 + [800_000] * 5
+    assert rates == [200_000] * 15 + [800_000] * 5
 
 
 def test_a_receiver_that_has_left_is_forgotten_and_the_rate_stays_at_its_least():

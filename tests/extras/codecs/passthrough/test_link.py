@@ -73,7 +73,7 @@ def test_a_budget_that_was_lowered_too_far_can_be_raised_again(adapt):
 
 def test_without_reports_all_goes_out():
     """Somebody who only listens would get a keyframe now and then."""
-    units = camera(13, key_bytes=15_000)
+    units = camera(20, key_bytes=15_000)
     _, got = flown([(0, GOOD_BPS)], units, surveyed=units[: 8 * FPS], late_s=lambda _second: None)
     assert sum(got) > 8 * FPS
     assert got[-6:] == [FPS] * 6
