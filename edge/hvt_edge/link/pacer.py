@@ -39,6 +39,9 @@ _PROBE_NS = SECOND_NS
 _START_NS, _START_HOLD_NS = SECOND_NS // 2, 8 * SECOND_NS
 """Before the first report, frames go for half a second from a keyframe on, then one in `_PROBE_NS` for eight: a thin
 link that is overrun at once leaves no room to query info. A ground that never reports gets every frame after that."""
+_VIDEO_ALONE_NS = 5 * SECOND_NS
+"""The longest time in which video alone finds the rate: on a thin link stills would fill the queue meanwhile. A clip
+may end before, and what is stored goes out after it."""
 _FORGET_NS = 15 * SECOND_NS
 """A receiver silent for this long has left, where Zenoh still has the link: its lease is shorter. Other subscribers
 get video at the least rate, since behind a router the link may be gone all the same."""
@@ -478,8 +481,8 @@ class Pacer:
 
     def admits_still(self, now_ns: int) -> bool:
         with self._lock:
-            if self.begins:
-                return False  # video alone finds the rate: on a thin link stills would fill the queue
+            if self.begins and now_ns - (self._began_ns or now_ns) < _VIDEO_ALONE_NS:
+                return False
             if self._reported_ns is None:
                 return self._may_start(now_ns)
             return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
