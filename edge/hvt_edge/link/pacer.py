@@ -41,7 +41,7 @@ _START_NS, _START_HOLD_NS = SECOND_NS // 2, 8 * SECOND_NS
 link that is overrun at once leaves no room to query info. A ground that never reports gets every frame after that."""
 _VIDEO_ALONE_NS = 5 * SECOND_NS
 """The longest time in which video alone finds the rate: on a thin link stills would fill the queue meanwhile. A clip
-may end before, and what is stored goes out after it."""
+may end before that, and stored objects go out then."""
 _FORGET_NS = 15 * SECOND_NS
 """A receiver silent for this long has left, where Zenoh still has the link: its lease is shorter. Other subscribers
 get video at the least rate, since behind a router the link may be gone all the same."""
