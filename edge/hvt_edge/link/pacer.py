@@ -38,10 +38,8 @@ _PROBE_NS = SECOND_NS
 """In silence one frame is sent in this time: a ground that has forgotten the session receives nothing else."""
 _START_NS, _START_HOLD_NS = SECOND_NS // 2, 8 * SECOND_NS
 """Before the first report, frames go for half a second from a keyframe on, then one in `_PROBE_NS` for eight: a thin
-link that is overrun at once leaves no room to query info. A ground that never reports gets every frame after that."""
-_VIDEO_ALONE_NS = 5 * SECOND_NS
-"""The longest time in which video alone finds the rate: on a thin link stills would fill the queue meanwhile. A clip
-may end before that, and stored objects go out then."""
+link that is overrun at once leaves no room to query info. A ground that never reports gets every frame after that.
+So long the rate may be looked for, with video alone: a clip may end before it is found, or delays vary."""
 _FORGET_NS = 15 * SECOND_NS
 """A receiver silent for this long has left, where Zenoh still has the link: its lease is shorter. Other subscribers
 get video at the least rate, since behind a router the link may be gone all the same."""
@@ -394,11 +392,9 @@ class Pacer:
             self._progress_ns = now_ns
             return_ns, held_ns = now_ns - feedback.send_ns, 1000 * feedback.base_held_us
             late_back_ns = 0 if self._return.empty else max(0, return_ns - self._return_ns)
-            before, self._queued = (
-                self._queued,
-                self._late_ns(sent, now_ns) - held_ns - late_back_ns > _QUEUE_NS,
-            )
-            if self._queued and before:
+            queued_before = self._queued
+            self._queued = self._late_ns(sent, now_ns) - held_ns - late_back_ns > _QUEUE_NS
+            if self._queued and queued_before:
                 self._drain_to = self._flight.last_base
             if sent.sequence <= given_up and not self._take_longer(sent, return_ns, now_ns):
                 return
@@ -442,8 +438,8 @@ class Pacer:
             if there and reports and self._began_ns is None:
                 self._began_ns = now_ns
                 self._controller.begin()
-            if self._began_ns is not None and now_ns - self._began_ns >= _FORGET_NS:
-                self._controller.trust()
+            if self._began_ns is not None and now_ns - self._began_ns >= _START_HOLD_NS:
+                self._controller.settle()
             if before and not there:
                 self._flight.clear()
                 if self._reported_ns is not None:
@@ -481,8 +477,8 @@ class Pacer:
 
     def admits_still(self, now_ns: int) -> bool:
         with self._lock:
-            if self.begins and now_ns - (self._began_ns or now_ns) < _VIDEO_ALONE_NS:
-                return False
+            if self.begins:
+                return False  # on a thin link stills would fill the queue
             if self._reported_ns is None:
                 return self._may_start(now_ns)
             return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)

@@ -58,8 +58,6 @@ _BEGIN_SHARE = 4
 """A flight begins at this part of the ceiling: a smaller one delays a thin link less, and all others show it."""
 _BEGIN_NS = SECOND_NS
 """Time of the growth from there to the ceiling, on a good link: each flight begins with the poorer pictures."""
-_LONGEST_BEGIN_NS = 5 * SECOND_NS
-"""A rate that is not found by then, where delays vary, grows like any other."""
 _LEAST_STEP = 1.05
 """Growth with each report then, however little there is to send: a dark scene or few stills prove no rate."""
 _SUSTAINED = 0.9
@@ -208,7 +206,6 @@ class RateController:
         self._plateau_ns = _PLATEAU_NS
         self._curve_ns = 2**62
         """Time along the curve of growth; only time without signs of congestion counts."""
-        self._begin_left_ns = _LONGEST_BEGIN_NS
         self._last_ns: int | None = None
         self._silent = False
         self._losses = LossCount()
@@ -243,7 +240,6 @@ class RateController:
     def on_progress(self, progress: Progress) -> None:
         """Process one report that names a message for the first time."""
         step_ns = self._elapsed(progress.now_ns)
-        self._begin_left_ns -= step_ns
         excess_ns = self._excess(progress)
         if progress.sent_ns < self._judge_from_ns:
             return
@@ -251,8 +247,9 @@ class RateController:
         self._recent.append((progress, excess_ns))
         self._losses.add(progress.messages, progress.lost)
         limit_ns = self._limit_ns()
-        if self.begins and self._pace() < _OUTRUN:
-            self._back_off(progress, _BACKOFF * min(self._rate, self._lately_bps()))
+        pace, arriving_bps = self._lately() or (1.0, 0.0)
+        if self.begins and pace < _OUTRUN:
+            self._back_off(progress, _BACKOFF * min(self._rate, arriving_bps))
         elif excess_ns >= limit_ns // 2 and self._is_longer_route():
             self._take_longer_route()
         elif self._overused(limit_ns) and self._rate > self._floor_bps:
@@ -268,18 +265,19 @@ class RateController:
     @property
     def begins(self) -> bool:
         """It is on its way up from `begin`, and nothing has held it yet."""
-        climbs = self._plateau_ns == _BEGIN_NS and self._curve_ns < _BEGIN_NS
-        return climbs and self._begin_left_ns > 0 and not self.at_ceiling
+        return self._plateau_ns == _BEGIN_NS and self._curve_ns < _BEGIN_NS and not self.at_ceiling
 
     def begin(self) -> None:
         """Nothing is known of the link: the rate begins low, and nears the former one as fast as messages come."""
         lowest = max(self._floor_bps, self.ceiling_bps / _BEGIN_SHARE)
         self._climb_from(min(self._rate, lowest), plateau_ns=_BEGIN_NS)
 
-    def trust(self) -> None:
-        """Nobody has reported anything, ever, and nobody will: the rate is the ceiling."""
-        if self._last_ns is None:
+    def settle(self) -> None:
+        """It has begun long enough: a ground that never reports gets the ceiling, others a growth like any other."""
+        if self.begins and self._last_ns is None:
             self._rate = float(self.ceiling_bps)
+        elif self.begins:
+            self._plateau_ns = _RESUME_NS
 
     def on_silence(self, now_ns: int) -> None:
         """Reports have stopped: the rate falls to the floor. When they return it nears the former rate quickly."""
@@ -405,35 +403,28 @@ class RateController:
         last_ns = self._recent[-1][0].arrived_ns
         return max(one.delivery_bps for one, _ in self._recent if last_ns - one.arrived_ns <= SECOND_NS)
 
-    def _lately(self) -> tuple[Progress, Progress] | None:
-        # The first and the last report of about the last second; None after less than half of one.
+    def _lately(self) -> tuple[float, float] | None:
+        # Of the reports of about the last second: the speed at which messages came over that at which they were
+        # sent, and their arrival rate; None after less than half a second.
         last = first = self._recent[-1][0]
         for first, _ in reversed(self._recent):
             if last.arrived_ns - first.arrived_ns >= SECOND_NS:
                 break
-        return (first, last) if last.arrived_ns - first.arrived_ns >= SECOND_NS // 2 else None
-
-    def _pace(self) -> float:
-        # The speed at which messages came, over that at which they were sent; 1 where nobody knows.
-        lately = self._lately()
-        if lately is None:
-            return 1.0
-        first, last = lately
-        return (last.sent_ns - first.sent_ns) / (last.arrived_ns - first.arrived_ns)
-
-    def _lately_bps(self) -> float:
-        lately = self._lately()
-        return self._rate if lately is None else _arrival_bps(*lately)
+        span_ns = last.arrived_ns - first.arrived_ns
+        if span_ns < SECOND_NS // 2:
+            return None
+        return (last.sent_ns - first.sent_ns) / span_ns, _arrival_bps(first, last)
 
     def _lately_proven_bps(self) -> float:
         # A multiple of the arrival rate of about the last second; the present rate if that is not known yet.
-        arrival_bps = self._lately_bps()
-        if self._lately() is None:
-            return arrival_bps
+        lately = self._lately()
+        if lately is None:
+            return self._rate
+        pace, arrival_bps = lately
         if self._plateau_ns not in (_BEGIN_NS, _RESUME_NS) or self._curve_ns >= self._plateau_ns:
             return 2 * arrival_bps
         # On the way up the least delay may itself be that of a queue, and show no excess.
-        if self._pace() < _SUSTAINED:
+        if pace < _SUSTAINED:
             return arrival_bps
         return max(3 * arrival_bps, _LEAST_STEP * self._rate if self.begins else 0)
 

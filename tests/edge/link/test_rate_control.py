@@ -418,7 +418,7 @@ def test_a_ground_that_never_reports_gets_the_whole_budget_in_the_end():
         pacer.link(True, now_ns=second * S)
         rates.append(pacer.rate_bps)
         pacer.sent_base(second, 5_000, now_ns=second * S, keyframe=True)
-    assert rates == [200_000] * 15 + [800_000] * 5
+    assert rates == [200_000] * 8 + [800_000] * 12
 
 
 def test_a_receiver_that_has_left_is_forgotten_and_the_rate_stays_at_its_least():
