@@ -109,7 +109,12 @@ def _process_as_found() -> Iterator[None]:
     signals = {one: signal.getsignal(one) for one in STOP_SIGNALS}
     hooks = sys.excepthook, threading.excepthook
     priority = os.getpriority(os.PRIO_PROCESS, 0)
+    threads = set(threading.enumerate())
     yield
+    for one in set(threading.enumerate()) - threads:
+        if one.name.startswith("hvt-") and one.name != "hvt-detector":  # which waits for ever, of the process
+            one.join(20.0)
+            assert not one.is_alive(), f"{one.name} goes on into the tests after it"
     assert os.getpriority(os.PRIO_PROCESS, 0) == priority, "all tests after it would give way"
     sys.excepthook, threading.excepthook = hooks
     for one, handler in signals.items():

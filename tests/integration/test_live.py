@@ -60,12 +60,12 @@ class Late:
 def late(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
     """The edge plays from the start; a bare subscriber, a ground and then another ground join it.
 
-    Keyframes are on no schedule: each that comes after the first was asked for.
+    Keyframes are on no schedule, and the rate stays: each that comes after the first was asked for.
     """
     folder = tmp_path_factory.mktemp("late")
     with Link(folder, name="late") as link:
         edge = link.edge(
-            *arguments(long_scene, "uav-1", "--wait", "0s", "--keyframe-interval", "0s"),
+            *arguments(long_scene, "uav-1", "--wait", "0s", "--keyframe-interval", "0s", "--no-adapt"),
             *("--record-base", "base.mkv"),
             listens=True,
         )

@@ -3,7 +3,7 @@
 import json
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from http.client import HTTPConnection
 from operator import attrgetter
@@ -104,7 +104,7 @@ class Shown:
 
 
 @pytest.fixture
-def ground(tmp_path: Path) -> Ground:
+def ground(tmp_path: Path) -> Iterator[Ground]:
     """After five frames and a report of the edge."""
     flight = Flight(8)
     ground = Ground(tmp_path, flight)
@@ -113,7 +113,9 @@ def ground(tmp_path: Path) -> Ground:
     counts = {"deferred": {"cooldown": 3}, "dropped": {"base_good": 49, "too_large": 1}}
     ground.report(lambda status: replace(status, **counts))
     eventually(lambda: ground.opened[0].idle, what="the pictures are searched")
-    return ground
+    yield ground
+    if not ground.ended:
+        ground.end()
 
 
 def test_the_page_reads_all_of_it_as_sentences(ground):

@@ -85,7 +85,7 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(pipe, failures, caplog, mon
 def test_one_that_had_caught_up_is_told_of_again_however_late_it_was_before(failures, caplog, monkeypatch):
     """After a minute that a card once took, half a minute of a recording that a kill would lose went untold."""
     now_s, goes_on = [0.0], threading.Semaphore(0)
-    monkeypatch.setattr(queued, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(queued, "time", SimpleNamespace(**{**vars(time), "monotonic": lambda: now_s[0]}))
 
     class Slow(SinkWriter[float]):
         def log(self, item: float) -> None:
