@@ -111,10 +111,10 @@ def _process_as_found() -> Iterator[None]:
     priority = os.getpriority(os.PRIO_PROCESS, 0)
     threads = set(threading.enumerate())
     yield
-    for one in set(threading.enumerate()) - threads:
-        if one.name.startswith("hvt-") and one.name != "hvt-detector":  # which waits for ever, of the process
-            one.join(20.0)
-            assert not one.is_alive(), f"{one.name} goes on into the tests after it"
+    for thread in set(threading.enumerate()) - threads:
+        if thread.name.startswith("hvt-") and thread.name != "hvt-detector":  # which lives as the process does
+            thread.join(20.0)
+            assert not thread.is_alive(), f"{thread.name} goes on into the tests after it"
     assert os.getpriority(os.PRIO_PROCESS, 0) == priority, "all tests after it would give way"
     sys.excepthook, threading.excepthook = hooks
     for one, handler in signals.items():
