@@ -112,7 +112,9 @@ def _process_as_found() -> Iterator[None]:
     threads = set(threading.enumerate())
     yield
     for thread in set(threading.enumerate()) - threads:
-        if thread.name.startswith("hvt-") and thread.name != "hvt-detector":  # which lives as the process does
+        if (
+            thread.name.startswith("hvt-") and thread.name != "hvt-detector"
+        ):  # which lives as the process does
             thread.join(20.0)
             assert not thread.is_alive(), f"{thread.name} goes on into the tests after it"
     assert os.getpriority(os.PRIO_PROCESS, 0) == priority, "all tests after it would give way"
