@@ -148,6 +148,8 @@ def _with_progress(store: Store, entry: ModelEntry, bar: Progress) -> Path:
 def _verify(arguments: argparse.Namespace) -> int:
     store = Store()
     names = arguments.names or [name for name in store.entries if store.is_there(name)]
+    for name in names:
+        store.entry(name)  # a wrong one is said before anything is read
     if not names:
         print(f"no models in {store.folder}")
     wrong = 0

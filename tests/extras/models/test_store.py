@@ -475,7 +475,16 @@ def test_list_and_verify_say_what_is_here(
 
 
 @pytest.mark.parametrize(
-    "argv", [[], ["fetch"], ["fetch", "yolox-q"], ["path", "nothing"], ["info", "no.onnx"], ["x"]]
+    "argv",
+    [
+        [],
+        ["fetch"],
+        ["fetch", "yolox-q"],
+        ["path", "nothing"],
+        ["info", "no.onnx"],
+        ["x"],
+        ["verify", "a\n", "b"],
+    ],
 )
 def test_wrong_arguments_are_one_sentence(
     folder: Path, argv: list[str], capsys: pytest.CaptureFixture[str]
