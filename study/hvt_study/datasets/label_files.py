@@ -15,9 +15,11 @@ import math
 import os
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from glob import escape
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -59,11 +61,15 @@ _OTHER_WORDS = re.compile(
     re.IGNORECASE,
 )
 """In the first bytes of files that hold labels of a kind that is not read; XML has bounding boxes of places."""
-_LOOKED_AT = 65536
+_OTHER_TABLES = (".geojson", ".mat", ".npy", ".npz", ".parquet", ".tfrecord", ".tsv")
+_NUMBERS = re.compile(rb"(?im)^(?:\S+[,;\s]+)?(?:(?:[-+]?[\d.]+(?:e[-+]?\d+)?|nan)(?:[,;\s]+|$)){4}")
+"""Of a line with four numbers, be it behind a word."""
+_LOOKED_AT, _LOOKED_INTO = 65536, 1000
 _CLASSES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml")
 _COCO = ("labels.json", "result.json", "annotations.json", "_annotations.coco.json", "coco.json")
 _COCO_BOXES = "instances_"
 """COCO's own name for the file with boxes, beside captions and keypoints of the same pictures; CVAT's too."""
+_COCO_WORDS = "captions_"
 _DEPTH = 3
 
 
@@ -136,30 +142,48 @@ def label_file(picture: Path, place: Path, folders: Folders) -> Path | None:
     return next((file for file in found if file is not None and file.is_file()), None)
 
 
-def check_strange(place: Path, pictures: Sequence[Path]) -> None:
-    """Raise `UserError` for labels of a kind that is not read, which nobody means to be left out."""
-    place = place.resolve()
-    homes = dict.fromkeys(one.parent.resolve() for one in pictures)
-    folders = dict.fromkeys((place, *homes))
-    strange = [
+def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) -> str:
+    """A sentence on the files of a set that look like labels and are not among those ``used``; empty for none.
+
+    Raises `UserError` where none was used and one of the others holds labels of a kind that is not read.
+    """
+    place, known = place.absolute(), {path.absolute() for path in used}
+    homes = dict.fromkeys(one.parent.absolute() for one in pictures)
+    named = [
         (folder / name, f"labels of {kind}")
-        for folder in dict.fromkeys((*folders, *(home.parent for home in homes)))
+        for folder in dict.fromkeys((place, *homes, *(home.parent for home in homes)))
         for name, kind in _OTHER.items()
         if "." in name
         or folder.is_relative_to(place)  # a folder beside the one that is given may have any name
     ]
-    strange += [(file.with_suffix(".json"), "labels of LabelMe") for file in pictures[:_DEPTH]]
-    for folder in folders:
-        for file in sorted(folder.iterdir()):
-            if file.suffix.lower() in _OTHER_FILES and file.is_file():
-                with suppress(OSError), file.open("rb") as opened:
-                    if _OTHER_WORDS.search(opened.read(_LOOKED_AT).replace(b"\0", b"")):
-                        strange.append((file, "labels, it seems"))
-    for path, what in strange:
-        if path.exists() and not _holds_camera_poses(path):
-            raise UserError(
-                f"{path} holds {what}, which are not read: export them as COCO, YOLO or Pascal VOC"
-            )
+    named += [(file.with_suffix(".json"), "labels of LabelMe") for file in pictures[:_DEPTH]]
+    sure = {path: what for path, what in named if path.exists() and not _holds_camera_poses(path)}
+    folders = dict.fromkeys((*homes, *_folders(place, _DEPTH)))
+    beside = [one for home in homes for one in home.parent.glob(f"{escape(home.name)}[._]*")]
+    files = (one for folder in folders for one in sorted(folder.iterdir()))
+    unread = []
+    for path in islice((one for one in (*files, *beside) if _may_hold_labels(one, known)), _LOOKED_INTO):
+        with suppress(OSError), path.open("rb") as opened:
+            start = opened.read(_LOOKED_AT).replace(b"\0", b"")
+            if path.suffix.lower() in _OTHER_FILES and _OTHER_WORDS.search(start):
+                sure.setdefault(path, "labels, it seems")
+            elif path.suffix.lower() in _OTHER_TABLES or _NUMBERS.search(start):
+                unread.append(path)
+    if sure and not known:
+        path, what = next(iter(sure.items()))
+        raise UserError(f"{path} holds {what}, which are not read: export them as COCO, YOLO or Pascal VOC")
+    unread = [*dict.fromkeys((*sure, *unread))]
+    if not unread:
+        return ""
+    return (
+        f"{len(unread)} files were not read as labels, the first: {unread[0]}; accepted are YOLO's, Pascal VOC's or "
+        "VisDrone's of a picture by its name, and COCO's JSON"
+    )
+
+
+def _may_hold_labels(path: Path, known: Container[Path]) -> bool:
+    named = path.suffix.lower() in (*_OTHER_FILES, *_OTHER_TABLES, ".txt")
+    return named and path not in known and not path.name.startswith(_COCO_WORDS) and path.is_file()
 
 
 def _holds_camera_poses(path: Path) -> bool:
@@ -295,6 +319,12 @@ def read_voc(path: Path) -> VocFile:
         if b"<!ENTITY" in content.replace(b"\0", b""):  # in UTF-16 too
             raise UserError(f"{path} is not an XML of Pascal VOC (it has entities)")
         root = ET.fromstring(content)  # noqa: S314 - no entities; in the encoding that it says
+        for one in root.iter():  # Esri's tools write XMin
+            one.tag = one.tag.rpartition("}")[2].lower()
+        if root.tag != "annotation" and root.find(".//object") is None:
+            raise UserError(
+                f"{path} is not an XML of Pascal VOC (its root is {root.tag:.60}, not annotation)"
+            )
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror})") from None
     except (ET.ParseError, ValueError, LookupError) as error:

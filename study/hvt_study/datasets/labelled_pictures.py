@@ -143,6 +143,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     elif texts and not visdrone:
         names = label_files.yolo_names(place, classes, files)
         keypoints = label_files.keypoint_columns(label_files.class_file(place, files))
+    doubts.unread = label_files.check_unread(place, files, found.values())
     return [
         LabelledPicture(
             file,
@@ -184,14 +185,16 @@ def _has_commas(texts: Sequence[Path]) -> bool:
 
 
 def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> list[LabelledPicture]:
-    found = [one for path in label_files.coco_files(place) for one in _coco_pictures(path, doubts)]
+    read = label_files.coco_files(place)
+    found = [one for path in read for one in _coco_pictures(path, doubts)]
     if found:
+        doubts.unread = label_files.check_unread(place, files, read)
         return found
     if any((place / folder).is_dir() for folder in ("labels", "annotations", "Annotations")):
         some = f"any of its {len(files)} pictures, such as {files[0].name}"
         raise UserError(f"{place} has no label of {some}: looked in {label_files.LOOKED_IN}")
-    label_files.check_strange(place, files)
-    return [LabelledPicture(file, None, ()) for file in files]
+    doubts.unread = label_files.check_unread(place, files, ())
+    return [LabelledPicture(file, None, (), doubts=doubts) for file in files]
 
 
 def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:

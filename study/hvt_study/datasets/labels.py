@@ -80,6 +80,8 @@ class LabelDoubts:
     kinds: set[float] = field(default_factory=set)
     """Classes by number, where a set counts them, and how many it names."""
     classes: int = 0
+    unread: str = ""
+    """A sentence on files that nobody understood."""
     _clipped: int = 0
     _worst: tuple[float, str] = (0.0, "")
     _left_out: int = 0
@@ -137,7 +139,7 @@ class LabelDoubts:
         return inside, np.flatnonzero(solid)
 
     def sentences(self) -> list[str]:
-        said = []
+        said = [self.unread] if self.unread else []
         if self._clipped:
             px, where = self._worst
             said.append(

@@ -105,6 +105,7 @@ LAYOUTS = {
     "FiftyOne, COCODetectionDataset": ("data/a.jpg", {"labels.json": coco()}),
     "labelImg": ("a.jpg", {"a.txt": ROW, "classes.txt": CLASSES}),
     "labelImg, VOC": ("a.jpg", {"a.xml": (voc(), "utf-8-sig")}),
+    "Esri, VOC": ("images/a.jpg", {"labels/a.xml": voc().replace("<x", "<X").replace("</x", "</X")}),
     "CVAT, YOLO 1.1": ("obj_train_data/a.jpg", {"obj_train_data/a.txt": ROW, "obj.names": CLASSES}),
     "CVAT, COCO 1.0": ("images/a.jpg", {"annotations/instances_default.json": coco()}),
     "CVAT, PASCAL VOC 1.1": ("JPEGImages/a.jpg", {"Annotations/a.xml": voc()}),
@@ -342,6 +343,8 @@ REFUSED = [
     ({"train.jsonl": '{"image": "a.jpg", "bbox": [1, 2, 3, 4]}'}, UNREAD),
     ({"vott.json": '{"regions": [{"boundingBox": {}}]}'}, UNREAD),
     ({"via.json": '{"a.jpg1": {"regions": [{"shape_attributes": {}}]}}'}, UNREAD),
+    ({"export/a.ndjson": '{"projects": {"annotations": {"objects": []}}}'}, UNREAD),
+    ({"images/a.xml": "<kml/>"}, r"a\.xml is not an XML of Pascal VOC \(its root is kml"),
     # Of labels in pixels nothing is right; of classes from 1, each would be the next one, and the last left out.
     (
         {"images/a.txt": "1 50 35 60 50\n", "classes.txt": CLASSES},
@@ -393,6 +396,26 @@ def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
     text(tmp_path / "groundtruth.txt", "20,10,40,40")
     with pytest.raises(UserError, match=UNREAD):
         find_pictures(place, classes=None)
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"anno/bike1.txt": "NaN,NaN,NaN,NaN\n20,10,60,50\n"},  # UAV123
+        {"img/groundtruth_rect.2.txt": "20\t10\t60\t50\n"},  # OTB, of two targets
+        {"labels.csv": "image,a,b,c,d,label\na.jpg,20,10,80,60,bus\n"},
+        {"train.txt": "img/a.jpg 20,10,80,60,1\n"},
+        {"train.tfrecord": "\n"},
+        {"img/b.txt": ROW, "img/a.txt": ROW, "classes.txt": CLASSES},  # b has no picture
+        {"img/b.json": '{"shapes": []}', "img/a.txt": ROW, "classes.txt": CLASSES},
+    ],
+)
+def test_files_that_are_not_understood_are_named(tmp_path, files):
+    """Pictures were "not labelled", and nobody said that the file beside them was passed over."""
+    lay(tmp_path, "img/a.jpg", **files)
+    found = find_pictures(tmp_path, classes=None)
+    first = next(iter(files))
+    assert doubts_of(found)[0].startswith(f"1 files were not read as labels, the first: {tmp_path / first}; ")
 
 
 XML_OBJECT = voc()[voc().index("<object>") :]
