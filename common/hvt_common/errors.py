@@ -344,6 +344,11 @@ def _discard(stream: TextIO) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+def not_installed(what: str, package: str) -> UserError:
+    """The error of an option whose extra is absent, with the ``package`` that brings it, such as ``hvt[edge]``."""
+    return UserError(f"{what} is of an extra that is not installed: pip install '{package}'")
+
+
 @contextmanager
 def needs_extra(install: str) -> Iterator[None]:
     """Within it a missing package is a `UserError` that names it for ``pip install``, such as ``'hvt[study]'``."""

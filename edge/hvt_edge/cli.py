@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import exit_with_sentence, not_installed
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import START_LOGGER, start_log
 from hvt_common.runtime.plug_ins import loaded, the_one
@@ -52,9 +52,7 @@ def _run(argv: Sequence[str] | None) -> int:
             limit_malloc_arenas()
             return int(loaded(entry, lambda run: run, what="command")(words[1:]))
         if words[0] in _BROUGHT:
-            raise UserError(
-                f"hvt-edge {words[0]} is of an extra that is not installed: pip install 'hvt[edge]'"
-            )
+            raise not_installed(f"hvt-edge {words[0]}", "hvt[edge]")
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
     redaction = Redaction([*words, *given.values.values()])

@@ -8,17 +8,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rerun.chunk import Chunk
-
-from hvt_archive.reading.readable import id_of
-from hvt_archive.reading.recorded import readable_part
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import UserError, exit_with_sentence, needs_extra
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
-from hvt_ground.sinks.rerun.blueprint import comparison
-from hvt_ground.sinks.rerun.rrd_file import open_rrd
-from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
+
+if TYPE_CHECKING:
+    from rerun.chunk import Chunk
 
 _FLUSH_S = 10.0
 
@@ -29,6 +26,14 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
     Raises:
         UserError: a file is no recording, or two are of the same edge.
     """
+    from hvt_ground.sinks.rerun.blueprint import comparison  # noqa: PLC0415 - they need Rerun
+    from hvt_ground.sinks.rerun.sdk import (  # noqa: PLC0415
+        RecordingId,
+        new_recording,
+        releasing_recordings,
+        send_blueprint,
+    )
+
     check_writable(out, name="--out", reads=paths)
     read = [_read(path) for path in paths]
     edges = [edge for edge, _ in read]
@@ -51,6 +56,10 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
 
 def _read(path: Path) -> tuple[str, list[Chunk]]:
     # The edge's id, and everything but the file's own entities; of a damaged file its readable part.
+    from hvt_archive.reading.readable import id_of  # noqa: PLC0415
+    from hvt_archive.reading.recorded import readable_part  # noqa: PLC0415
+    from hvt_ground.sinks.rerun.rrd_file import open_rrd  # noqa: PLC0415
+
     with readable_part(path, done="joined") as (found, _):
         reader = open_rrd(found)
         chunks = [one for one in reader.stream() if not one.entity_path.startswith("/__")]
@@ -67,7 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--fps", type=float, default=15.0, help="of the frame timeline (default 15)")
     given = parser.parse_args(argv)
     size = parse_size(given.size, name="--size")
-    join_recordings(given.recordings, given.out, base_size=size, fps=given.fps)
+    with needs_extra("'hvt[ground]'"):
+        join_recordings(given.recordings, given.out, base_size=size, fps=given.fps)
     return 0
 
 

@@ -15,10 +15,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rerun.experimental import ViewerClient
 
-from hvt_archive.viewer import free_port, started_viewer
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import UserError, exit_with_sentence, needs_extra
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 
@@ -33,6 +31,8 @@ def screenshot(recording: Path, *, frame: int, out: Path, size: tuple[int, int] 
     and lay out. Raises `UserError` where a file or a part that the viewer needs is missing, or the viewer does not
     start.
     """
+    from hvt_archive.viewer import free_port, started_viewer  # noqa: PLC0415 - they need Rerun
+
     if not recording.is_file():
         raise UserError(f"recording {recording} does not exist: give an .rrd file")
     check_writable(out, name="--out", reads=[recording])
@@ -59,6 +59,8 @@ def screenshot(recording: Path, *, frame: int, out: Path, size: tuple[int, int] 
 
 
 def _picture(port: int, recording: Path, *, frame: int) -> bytes:
+    from rerun.experimental import ViewerClient  # noqa: PLC0415
+
     client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
     client.open(str(recording.resolve()))
     deadline = time.monotonic() + _START_S
@@ -90,7 +92,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", default="1920x1080", help="window in pixels (default 1920x1080)")
     given = parser.parse_args(argv)
     size = parse_size(given.size, name="--size")
-    screenshot(given.recording, frame=given.frame, out=given.out, size=size)
+    with needs_extra("'hvt[ground]'"):
+        screenshot(given.recording, frame=given.frame, out=given.out, size=size)
     return 0
 
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import UserError, exit_with_sentence, needs_extra
+from hvt_common.errors import exit_with_sentence, needs_extra, not_installed
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
 from hvt_common.runtime.plug_ins import loaded, the_one
@@ -62,9 +62,7 @@ def _run(argv: Sequence[str] | None) -> int:
             install = "'hvt[ground]'" if words[0] in _BROUGHT else None
             return int(loaded(entry, lambda run: run, what="command", install=install)(words[1:]))
         if words[0] in _BROUGHT:
-            raise UserError(
-                f"hvt-ground {words[0]} is of an extra that is not installed: pip install 'hvt[ground]'"
-            )
+            raise not_installed(f"hvt-ground {words[0]}", "hvt[ground]")
     from hvt_ground.extras import checked, config_class  # noqa: PLC0415
 
     config, requested = load(config_class(), argv, program="hvt-ground", description=_DESCRIPTION)

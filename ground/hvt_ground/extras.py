@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
-from hvt_common.errors import UserError
+from hvt_common.errors import not_installed
 from hvt_common.runtime.plug_ins import installed, loaded
 from hvt_ground.config import GroundConfig, Written, check
 
@@ -41,8 +41,6 @@ _BRINGS = {
 }
 _BROUGHT_BY = {setting: package for package, settings in _BRINGS.items() for setting in settings}
 """Settings of the extras that come with HVT, and the package to install for each."""
-
-_ABSENT = "is of an extra that is not installed: pip install 'hvt[{}]'"
 
 NewFile = Callable[[Path, str, "Callable[[Path], SinkWriter[Event]]"], "Callable[[], SinkWriter[Event]]"]
 """Opens a file, or one of the suffix in a folder, by a name that no other session of this ground has."""
@@ -191,8 +189,9 @@ def config_class(extras: tuple[Extra[Any], ...] | None = None) -> type[GroundCon
     options.pop(GroundConfig, None)  # of an extra without settings
     whole = make_dataclass("GroundConfig", (), bases=(*options, GroundConfig), frozen=True)
     known = {field.name.replace("_", "-") for field in fields(whole)}
-    absent = {name: _ABSENT.format(package) for name, package in _BROUGHT_BY.items() if name not in known}
-    whole.GONE = absent  # type: ignore[attr-defined]
+    absent = {name: package for name, package in _BROUGHT_BY.items() if name not in known}
+    said = {name: str(not_installed("", f"hvt[{package}]")).lstrip() for name, package in absent.items()}
+    whole.GONE = said  # type: ignore[attr-defined]
     return cast("type[GroundConfig]", whole)
 
 
@@ -204,7 +203,7 @@ def locators(terrain: Path | None) -> Callable[[str], Locator]:
         if (found := extra.locators(terrain)) is not None:
             return found
     if terrain is not None:
-        raise UserError(f"--terrain {_ABSENT.format(_BROUGHT_BY['terrain'])}")
+        raise not_installed("--terrain", f"hvt[{_BROUGHT_BY['terrain']}]")
     return lambda _flight: NOWHERE
 
 

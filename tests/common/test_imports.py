@@ -17,6 +17,8 @@ HEAVY = {
         ("import hvt_ground.cli", HEAVY),
         ("import hvt_study.commands.compare", {"sklearn", "matplotlib"}),
         ("from hvt_ground.extras import config_class; config_class()", {"rerun", "onnxruntime", "zenoh"}),
+        # Where Rerun is not installed they say so.
+        ("import hvt_archive.joined, hvt_archive.screenshot", {"rerun"}),
     ],
 )
 def test_a_command_line_imports_what_its_settings_need_and_no_more(asked, heavy):

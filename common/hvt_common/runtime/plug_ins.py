@@ -6,7 +6,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
 
-from hvt_common.errors import UserError, foreign, needs_extra
+from hvt_common.errors import UserError, foreign, needs_extra, not_installed
 from hvt_common.runtime.failures import Failures
 
 
@@ -65,7 +65,7 @@ def library_part(side: str, name: str) -> Any:
     """The function of that name with which another program runs a side; `UserError` without its extra."""
     entry = the_one("hvt.library", side, what="library", built_in=False)
     if entry is None:
-        raise UserError(f"hvt_{side}.{name} is of an extra that is not installed: pip install 'hvt[{side}]'")
+        raise not_installed(f"hvt_{side}.{name}", f"hvt[{side}]")
     return loaded(entry, lambda found: found, what="library", install=f"'hvt[{side}]'")
 
 
@@ -90,7 +90,7 @@ def health_server(
     """
     entry = the_one(_GROUP, side, what="health server", built_in=False)
     if entry is None:
-        raise UserError("--metrics is of an extra that is not installed: pip install 'hvt[metrics]'")
+        raise not_installed("--metrics", "hvt[metrics]")
     # Only now: who is not watched needs no Prometheus.
     serve = loaded(entry, lambda found: found, what="health server", install="'hvt[metrics]'")
     server = serve(address, newest, clock=clock, stuck_s=stuck_s, failures=failures, lacks=lacks)

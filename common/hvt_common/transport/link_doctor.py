@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Self, cast
 
-from hvt_common.errors import UserError
+from hvt_common.errors import not_installed
 from hvt_common.protocol.channels import EdgeKeys
 from hvt_common.runtime.plug_ins import loaded, the_one
 
@@ -69,7 +69,7 @@ class LinkDoctor:
 
         The context is a `hvt_ground.link.group.Group`. Raises `UserError` where nothing shares.
         """
-        raise UserError("--group is of an extra that is not installed: pip install 'hvt[ground]'")
+        raise not_installed("--group", "hvt[ground]")
 
     def mend(
         self,

@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Final, Protocol, cast
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, not_installed
 from hvt_common.geodesy import interpolate
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import PoseEncoder, PoseReport
@@ -69,7 +69,7 @@ def open_pose(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) ->
     names = (word, _FILE)
     entry = next(filter(None, (the_one(_GROUP, one, what=_WHAT, built_in=False) for one in names)), None)
     if entry is None:
-        raise UserError(f"--pose {spec:.200} is of an extra that is not installed: pip install 'hvt[edge]'")
+        raise not_installed(f"--pose {spec:.200}", "hvt[edge]")
     opened = cast("OpenPose", loaded(entry, lambda it: it, what=_WHAT))
     return opened(spec, hfov_deg=hfov_deg, clock=clock)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, cast
 
-from hvt_common.errors import FlightError, NotYetError, UserError, absent, named_path
+from hvt_common.errors import FlightError, NotYetError, UserError, absent, named_path, not_installed
 from hvt_common.redaction import HIDDEN, redacted
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -102,7 +102,7 @@ def is_demo(spec: str) -> bool:
 def _drawn(spec: str, settings: SourceSettings, *, seed: int) -> Source:
     entry = the_one("hvt.scenes", "demo", what="scene", built_in=False)
     if entry is None:
-        raise UserError(f"--source {spec:.200} is of an extra that is not installed: pip install 'hvt[edge]'")
+        raise not_installed(f"--source {spec:.200}", "hvt[edge]")
     return cast("Source", loaded(entry, lambda draw: draw(spec, settings, seed=seed), what="scene"))
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, Protocol, cast
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, not_installed
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.runtime.plug_ins import installed, loaded, the_one
@@ -260,7 +260,7 @@ def check_encoder(name: str) -> None:
     built_in = name == X265
     entry = the_one(ENCODERS, name, what=_WHAT, built_in=built_in)
     if entry is None and name in _BROUGHT:
-        raise UserError(f"--encoder {name} is of an extra that is not installed: pip install 'hvt[edge]'")
+        raise not_installed(f"--encoder {name}", "hvt[edge]")
     if not built_in and entry is None:
         raise UserError(f"--encoder {name!r} is not known: choose one of {', '.join(encoder_names())}")
 

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import cast
 
-from hvt_common.errors import NotYetError, UserError, check_apart
+from hvt_common.errors import NotYetError, UserError, check_apart, not_installed
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.reporting import check_writable
@@ -41,7 +41,7 @@ def open_local_copy(path: Path, *, failures: Failures, wait: bool) -> AbstractCo
     """An extra's writer of the base stream to a file; ``wait``: it blocks where the card is slower (lockstep)."""
     entry = the_one(_COPIES, "base", what="local copy", built_in=False)
     if entry is None:
-        raise UserError("--record-base is of an extra that is not installed: pip install 'hvt[edge]'")
+        raise not_installed("--record-base", "hvt[edge]")
     made = loaded(entry, lambda copy: copy(path, failures=failures, wait=wait), what="local copy")
     return cast("AbstractContextManager[LocalCopy]", made)
 

@@ -14,7 +14,7 @@ from importlib.metadata import EntryPoint
 from types import MappingProxyType
 from typing import Any
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, not_installed
 from hvt_common.runtime.plug_ins import installed, loaded, origin, the_one
 from hvt_common.video.still_codecs.contract import StillCodec
 
@@ -57,9 +57,7 @@ def still_codec(name: str) -> StillCodec:
     if entry is not None:
         return _plugged_in(entry)
     if name in _BROUGHT_BY:
-        raise UserError(
-            f"still codec {name!r} is of an extra that is not installed: pip install '{_BROUGHT_BY[name]}'"
-        )
+        raise not_installed(f"still codec {name!r}", _BROUGHT_BY[name])
     raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
 
 
