@@ -13,7 +13,7 @@ from hvt_ground.sinks.palette import AMBER, GREY, SKY, VERMILLION, WHITE, class_
 from hvt_ground.sinks.rerun.labels import LEGEND_POINTS, place_legend, points
 from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, LAYERS, REPORTED_MARK
 from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS
-from hvt_ground.sinks.rerun.tables import static_chunk
+from hvt_ground.sinks.rerun.tables import packed, static_chunk
 
 BASE = "/base/"
 """With the name of a layer it is the place of its boxes."""
@@ -131,15 +131,13 @@ def class_chunk(path: str, class_ids: Mapping[tuple[str, int], int]) -> Chunk:
 
     Written again when a class is new; the last one holds for the whole recording, so ids must not change.
     """
-    return static_chunk(
-        path,
-        rr.AnnotationContext(
-            [
-                rr.AnnotationInfo(number, name, dimmed(class_colour(name), share=BRIGHTNESS[level]))
-                for (name, level), number in class_ids.items()
-            ]
-        ),
-    )
+    classes = [
+        (number, ((number, name, packed(dimmed(class_colour(name), share=BRIGHTNESS[level]))), (), ()))
+        for (name, level), number in class_ids.items()
+    ]
+    # In Arrow at once: the SDK's own way there imports Arrow's functions, 50 ms and 7 MB in a flight's first second.
+    arrow_type = rr.components.AnnotationContextBatch._ARROW_DATATYPE  # noqa: SLF001
+    return static_chunk(path, rr.AnnotationContext(pa.array([classes], arrow_type)))
 
 
 def legend_chunk(class_names: Sequence[str], *, size: tuple[int, int]) -> Chunk:
