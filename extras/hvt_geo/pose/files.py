@@ -70,6 +70,8 @@ _UNKNOWN_YAW = (655.35, 65535.0)
 _UNSAID = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 """How programs write that they have no value, in small letters."""
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+\s*", re.ASCII)
+_NO_TIME_OF_DAY = re.compile(r"\s*(?:[\d.]+|[\d-]{10})\s*", re.ASCII)
+"""Python takes a day alone for its midnight, and some milliseconds since 1970 for a day of old."""
 _Values = Mapping[str, float]
 
 
@@ -257,8 +259,14 @@ def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     if missing:
         raise UserError(f"pose file {path} lacks the column {missing[0]}")
     for number, line in enumerate(lines, 1):
+        where = f"pose file {path}, row {number}"
+        if any(cell.strip() for cell in line.get(None, ())):  # csv keeps the rest there
+            yield UserError(
+                f"{where} has more values than there are columns: is a decimal comma one of them?"
+            )
+            continue
         try:
-            row = _table_row({name: line.get(name) for name in names}, f"pose file {path}, row {number}")
+            row = _table_row({name: line.get(name) for name in names}, where)
         except UserError as error:
             yield error
             continue
@@ -337,7 +345,9 @@ def _number(text: str, where: str) -> float:
 
 def _utc_s(text: str, where: str) -> float:
     try:
-        time = datetime.fromisoformat(text.strip().upper().replace(" UTC", "Z"))
+        time = datetime.fromisoformat(
+            ("" if _NO_TIME_OF_DAY.fullmatch(text) else text).strip().upper().replace(" UTC", "Z")
+        )
     except ValueError:
         raise UserError(
             f"{where}: the time {text!r:.40} is not ISO 8601, such as 2026-11-23T10:00:00Z"

@@ -12,9 +12,10 @@ _NUMBER = r"[+-]?\d++(?:[.,]\d++)?+(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d)"
 """With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06'01"."""
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
-_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}")
-_HEMISPHERES = re.compile(rf"([EWNS])\s*:\s*({_NUMBER})")
-"""Autel's GPS(E: 8.5, N: 47.1, 30.5m)."""
+_LETTER = r"(?:\s?°?\s?([EWNS])\b)?"
+_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}{_LETTER}")
+_HEMISPHERES = re.compile(rf"([EWNS])\s*:\s*({_NUMBER})|({_NUMBER}){_LETTER[:-1]}")
+"""Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter behind the number."""
 _GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
 _HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})(?:\s*m\b|{_FEET[3:-2]})")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
@@ -77,11 +78,13 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
         if len(values) == 3:
             angle_names = (f"{prefix}pitch_deg", f"{prefix}roll_deg", f"{prefix}yaw_deg")
             row |= {name: value for name, (value, _) in zip(angle_names, values, strict=True)}
-    for name, said, feet in _NAMED.findall(body):
+    for name, said, feet, letter in _NAMED.findall(body):
         if name.lower() in _DJI:
             least, parts = _IN_PARTS.get(name.lower(), (0, 1))
             value = _value(said, feet=feet)
-            row[_DJI[name.lower()]] = value / parts if said.isdecimal() and value > least else value
+            value = value / parts if said.isdecimal() and value > least else value
+            southern = letter in ("W", "S") and name.lower() in ("latitude", "longitude", "longtitude")
+            row[_DJI[name.lower()]] = -abs(value) if southern else value
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
         row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
@@ -93,7 +96,7 @@ def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
     if found is None:
         return {}
     if letters := _HEMISPHERES.findall(found[1]):
-        values = [(letter, _value(number)) for letter, number in letters]
+        values = [(before or behind, _value(one or two)) for before, one, two, behind in letters]
         return {
             "longitude_deg" if letter in "EW" else "latitude_deg": -abs(value) if letter in "WS" else value
             for letter, value in values  # some write the sign as well

@@ -170,6 +170,9 @@ FIRST = MINI.split("2\n00:", maxsplit=1)[0]
         ("a.csv", f"{PLACE}\n0,north,2\n", "'north', not a number"),
         ("a.csv", f"{PLACE}\n0,1,2\n0,1,2\n", "do not rise"),
         ("a.csv", f"{PLACE}\n0,95,2\n", "latitude_deg is 95"),
+        ("a.csv", f"{PLACE}\n0,0,47,5,9,7\n", "row 1 has more values than there are columns"),
+        ("a.csv", "utc,latitude_deg,longitude_deg\n1701010112345,1,2\n", "'1701010112345' is not ISO 8601"),
+        ("a.csv", "utc,latitude_deg,longitude_deg\n2026-11-23,1,2\n", "'2026-11-23' is not ISO 8601"),
         (
             "a.csv",
             f"{PLACE}\n0,116.2,40.1\n1,116.2,40.1\n",
@@ -334,12 +337,18 @@ def test_subtitles_are_told_apart_by_their_times(tmp_path, change):
     assert {one.height_m for one in poses} == {30.0}
 
 
-@pytest.mark.parametrize("sign", ["", "-"])
-def test_autels_letters_say_which_number_is_which(tmp_path, sign):
-    """They are written longitude first, with or without a sign."""
-    line = (
-        f"HOME(W: 70.4, S: 33.1) 2020-01-01\nGPS(W: {sign}70.5, S: 33.25, 30.5m)\nG.PRY (-90.0°, 0.0°, 3.0°)"
-    )
+@pytest.mark.parametrize(
+    "place",
+    [
+        "GPS(W: 70.5, S: 33.25, 30.5m)",
+        "GPS(W: -70.5, S: 33.25, 30.5m)",
+        "GPS(33.25S, 70.5°W, 30)",
+        "[latitude: 33.25 S] [longitude: 70.5° W]",
+    ],
+)
+def test_letters_say_which_number_is_which(tmp_path, place):
+    """Autel's are written longitude first, with or without a sign; others' stand behind the number."""
+    line = f"HOME(W: 70.4, S: 33.1) 2020-01-01\n{place}\nG.PRY (-90.0°, 0.0°, 3.0°)"
     table, pose = read(tmp_path, "a.srt", blocks(lambda _: line))
     assert (pose.latitude_deg, pose.longitude_deg) == (-33.25, -70.5)
     assert not table.notes
