@@ -23,7 +23,7 @@ from hvt_study.cache import results
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""
 digest_of_file = cache(results.file_digest)
-"""Once in a study: a model that is changed under a running one is not noticed by it."""
+"""Once in a study, or until the file changes (`hvt_study.runs.run_context`)."""
 
 
 class CachedDetector(OnnxDetector):

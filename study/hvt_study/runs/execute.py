@@ -163,9 +163,9 @@ def runner(cache: Path) -> Callable[[RunSpec], RunRow]:
 def run_spec(spec: RunSpec, *, cache: Path, folder: Path = Path(), study: str = "") -> RunRow:
     """Do one run; a refusal of the edge, or an unforeseen error, becomes a row that says so.
 
-    Paths that are not absolute begin at ``folder``, such as the one in which the study was started; files are taken
-    to be the same as long as it is the same ``study``. A `UserError` ends it: dataset or models cannot be used, or
-    the cache not be written.
+    Paths that are not absolute begin at ``folder``, such as the one in which the study was started; of the same
+    ``study`` a file is read again where its time or size has changed. A `UserError` ends it: dataset or models cannot
+    be used, or the cache not be written.
     """
     with _in_flight:
         begin_study(study)

@@ -4,12 +4,13 @@ A study that is started again asks for little more than its `Materials`, for whi
 need none.
 """
 
+import logging
 import os
 import platform
 import tempfile
 import weakref
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,14 @@ from hvt_ground.config import DETECTOR, NONE
 from hvt_study.cache.cached_detector import CachedDetector, digest_of_file
 from hvt_study.cache.results import CacheError, ResultCache, content_key, file_digest, flight_code, installed
 from hvt_study.datasets.class_map import ClassMap, joint_classes
+from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.reference import ReferenceLabels, reference_labels, with_labels
 from hvt_study.datasets.sequence import Clip, Sequence, content_hash, stage_clip
 from hvt_study.runs.spec import ModelChoice, RunSpec
+
+_log = logging.getLogger(__name__)
 
 _PACKAGES = (
     *("numpy", "scipy", "opencv-python-headless", "av", "pillow", "pillow-jxl-plugin", "msgpack"),
@@ -67,6 +71,7 @@ def open_materials(spec: RunSpec, *, cache: Path) -> Materials:
 
     Raises `UserError` where the dataset or a model cannot be used, there are no labels, or they do not map.
     """
+    _forget_if_changed(spec)
     sequence, digest = _sequence(spec.dataset, spec.sequence)
     if spec.labels == "annotations" and sequence.labels is None:
         raise UserError(
@@ -130,20 +135,55 @@ def _classifier(spec: str, provider: str) -> Classifier | None:
 @lru_cache(maxsize=4)
 def model_digests(models: ModelChoice) -> dict[str, str]:
     """Digest of all files of each network, by its role; a process reads them once."""
+    return {role: " ".join(map(file_digest, paths)) for role, paths in _model_files(models).items()}
+
+
+@lru_cache(maxsize=4)
+def _model_files(models: ModelChoice) -> dict[str, tuple[Path, ...]]:
     named = {"detector": models.detector, "edge_detector": models.edge_detector}
     if models.classifier not in (DETECTOR, NONE):
         named["classifier"] = models.classifier
-    return {
-        role: " ".join(map(file_digest, files_of(resolve_model(one, role=role.removeprefix("edge_")))))
-        for role, one in named.items()
-    }
+    resolved = {role: resolve_model(one, role=role.removeprefix("edge_")) for role, one in named.items()}
+    return {role: tuple(files_of(path)) for role, path in resolved.items()}
 
 
 @lru_cache(maxsize=1)
 def begin_study(study: str) -> None:  # noqa: ARG001 - another one is another call
     """Forget all that is open for another study: Dask workers live on while labels are mended, models trained."""
-    for known in (_sequence, _detector, _classifier, model_digests, _open, digest_of_file):
-        known.cache_clear()
+    _forget()
+
+
+def _forget() -> None:
+    known = (
+        _sequence,
+        _detector,
+        _classifier,
+        model_digests,
+        _model_files,
+        _open,
+        digest_of_file,
+        _first_stamp,
+    )
+    for one in known:
+        one.cache_clear()
+
+
+@cache
+def _first_stamp(path: Path) -> tuple[int, int]:
+    return file_stamp(path)
+
+
+def _forget_if_changed(spec: RunSpec) -> None:
+    # Else a result of old weights, still open, would be kept under the name of new ones, or the reverse.
+    sequence, _ = _sequence(spec.dataset, spec.sequence)
+    models = (path for paths in _model_files(spec.models).values() for path in paths)
+    for path in (*models, *sequence.files):
+        if file_stamp(path) != _first_stamp(path):
+            _log.warning(
+                "%s was written while the study runs: runs from here on are of what it holds now", path
+            )
+            _forget()
+            return
 
 
 _OPEN_FILES = Path("/proc/self/fd")

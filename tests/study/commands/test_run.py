@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -219,17 +220,27 @@ def test_an_error_in_one_flight_is_one_row(scene, tmp_path, monkeypatch, caplog)
             execute.run_spec(spec, cache=plan.cache)
 
 
-def test_a_worker_that_outlives_a_study_looks_at_files_anew(tmp_path, monkeypatch):
-    """Labels are mended, and the workers of a cluster would go on with the old ones, and find the old flights."""
+def test_files_that_change_in_a_study_or_after_it_are_read_anew(tmp_path, monkeypatch, caplog):
+    """Labels are mended, weights trained again: runs of the new would be of the old, and kept under its name."""
     uri = write_scene(tmp_path / "scene", "street")
     (spec,) = first_runs(plan_of(uri, tmp_path / "cache"))
     monkeypatch.setattr(execute, "flown", lambda *_, **__: {}["none"])
     found = []
-    for study in ("one", "one", "two"):
-        found.append(execute.run_spec(spec, cache=tmp_path / "cache", study=study)["content"])
-        with (tmp_path / "scene" / "annotations" / "street.txt").open("a") as file:
-            file.write("1,99,0,0,9,9,1,4,0,0\n")
-    assert found[0] == found[1] != found[2]
+    labels, weights = tmp_path / "scene" / "annotations" / "street.txt", Path(detector(uri))
+    changes = [(labels, b""), (labels, b"1,99,0,0,9,9,1,4,0,0\n"), (weights, b"\x72\x07\x0a\x01a\x12\x02bc")]
+    for path, more in changes:
+        row = execute.run_spec(spec, cache=tmp_path / "cache", study="one")
+        found.append(json.loads(row["content"]))
+        path.write_bytes(path.read_bytes() + more)
+    found.append(json.loads(execute.run_spec(spec, cache=tmp_path / "cache", study="one")["content"]))
+    assert found[0] == found[1]
+    assert found[2]["clip"] != found[1]["clip"]
+    assert found[3]["clip"] == found[2]["clip"]
+    assert found[3]["detector"] != found[2]["detector"] == found[0]["detector"]
+    assert f"{weights} was written while the study runs" in caplog.text
+    open_before = open_materials(spec, cache=tmp_path / "cache").detector
+    execute.run_spec(spec, cache=tmp_path / "cache", study="two")
+    assert open_materials(spec, cache=tmp_path / "cache").detector is not open_before
 
 
 def test_a_classifier_names_the_reference_labels(scene, tmp_path):
