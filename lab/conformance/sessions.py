@@ -110,7 +110,8 @@ def _damaged() -> Iterator[dict[str, Any]]:
             _read(step, state, before=first.frame_index)
         except wire.WireError:
             yield {"hex": step.pack().hex(), "damaged": True}
-    yield {"hex": replace(second, frame_index=0).pack().hex(), "damaged": True}
+    for step in (second, replace(first, sequence=second.sequence)):
+        yield {"hex": replace(step, frame_index=0).pack().hex(), "damaged": True}
     for frame_index in (second.frame_index, 0):
         lost = replace(second, sequence=9, reference=8, frame_index=frame_index)
         yield {"hex": lost.pack().hex(), "skipped": True}
