@@ -27,6 +27,7 @@ from hvt_common.protocol.messages.fields import (
     WireError,
     wire_field,
 )
+from hvt_common.protocol.messages.stream import RoiHeader
 
 MAX_BACKLOG_BYTES = MAX_PAYLOAD_BYTES
 """Limit of one object: ten seconds of video at 3 Mbps."""
@@ -97,7 +98,7 @@ class BacklogStill:
     """A `RoiHeader` with the flag `STORED`, with the checksum of ``payload``."""
     encoding: str = wire_field(Text(_MAX_ENCODING_BYTES))
     """Zenoh's encoding: the media type."""
-    payload: bytes = wire_field(Blob(MAX_BACKLOG_BYTES, least=1))
+    payload: bytes = wire_field(Blob(RoiHeader.MAX_PAYLOAD, least=1))
 
 
 @dataclass(frozen=True, slots=True)

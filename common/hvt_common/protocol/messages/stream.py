@@ -126,7 +126,7 @@ class StillWire(OfStill):
 
     TRIMMED: ClassVar[bool] = True
 
-    place: tuple[int, ...] = wire_field(ListOf(_PLACE, 10))
+    place: tuple[int, ...] = wire_field(ListOf(_PLACE, 10, least=8))
     """The crop's x, y, width and height; how far the track's box lies inside its left, top, right and bottom side,
     in eighths; and, where it is not the crop's own, the coded size."""
     class_name: int | str = wire_field(Listed(MOST_CLASSES - 1, 64))
@@ -164,8 +164,8 @@ class StillWire(OfStill):
 
     def header(self) -> RoiHeader:
         """The header with its boxes unpacked; raises `WireError` for an impossible place."""
-        if len(self.place) not in (8, 10):
-            raise WireError(f"a place of {len(self.place)} numbers: 8 or 10 are accepted")
+        if len(self.place) == 9:
+            raise WireError("a place of 9 numbers: 8 or 10 are accepted")
         x1, y1, width, height, left, top, right, bottom, *coded = self.place
         crop = x1, y1, x1 + width, y1 + height
         box = (
