@@ -177,7 +177,6 @@ class LiveSource(Source):
                     self._take(shot, capture_ns, jitter_ns=camera_clock.jitter_ns)
                 except Exception as error:  # noqa: BLE001 - a driver or a decoder may raise any error
                     self._recover(error)
-                    camera_clock.forget()
         finally:
             self._grabber.close()
             self._end()
@@ -233,6 +232,10 @@ _MOST_BEHIND_NS = 2 * SECOND_NS
 """Delay that has grown beyond this step by step means another length of a second: 25 stamps a second, 24 frames."""
 _MOST_SET_NS = SECOND_NS
 """The same where the stamps go back: the camera's clock was set."""
+_PROOF_NS, _NEAR_NS = 10 * SECOND_NS, SECOND_NS // 10
+"""Stamps that come this near to the least delay after this time count the same second as we do: …"""
+_HELD_NS = 10 * SECOND_NS
+"""… a network holds such frames back, until their delay has not fallen for this long."""
 _RECENT = 32
 """Number of newest frames whose delays give the jitter."""
 _MOST_JITTER_NS = SECOND_NS // 4
@@ -249,15 +252,15 @@ class CameraClock:
     def __init__(self) -> None:
         self._last_ns = self._came_ns = 0
         """Capture time of the newest frame, and when it came."""
-        self.forget()
-
-    def forget(self) -> None:
-        """The camera was opened again: its stamps may count from another time from now on."""
-        self._least_ns: int | None = None
-        self._former_ns: int | None = None
+        self._least: list[int] = []
+        """The least delay of the present period, behind that of the one before."""
         self._camera_ns = 0
         """The newest frame's time by the camera."""
-        self._since_ns = 0
+        self._since_ns = self._begun_ns = 0
+        """When the present least delay was begun, and when the first for the stamps as they count now."""
+        self._proven = False
+        self._held_ns, self._fell_ns = 0, 0
+        """The least delay of a frame that was held back for long, and when it was found."""
         self._recent: deque[int] = deque(maxlen=_RECENT)
         """Delays of the newest frames."""
 
@@ -278,13 +281,22 @@ class CameraClock:
 
     def _ahead_ns(self, camera_ns: int, now_ns: int) -> int:
         delay_ns = now_ns - camera_ns
-        # Frames that a network held back are late, but their stamps go on; where they go back, a clock was set.
-        most_ns = _MOST_SET_NS if camera_ns < self._camera_ns else _MOST_BEHIND_NS
-        if self._least_ns is not None and delay_ns - self._least_ns > most_ns:
-            self._least_ns = self._former_ns = None
-        self._camera_ns = camera_ns
-        if self._least_ns is None or now_ns - self._since_ns > _MEMORY_NS:
-            self._former_ns, self._least_ns, self._since_ns = self._least_ns, delay_ns, now_ns
-        self._least_ns = min(self._least_ns, delay_ns)
-        least_ns = self._least_ns if self._former_ns is None else min(self._least_ns, self._former_ns)
+        if not self._least or self._counts_anew(camera_ns, delay_ns - min(self._least), now_ns):
+            self._least, self._begun_ns, self._since_ns, self._proven = [delay_ns], now_ns, now_ns, False
+        elif now_ns - self._since_ns > _MEMORY_NS:
+            self._least, self._since_ns = [self._least[-1], delay_ns], now_ns
+        self._camera_ns, self._least[-1] = camera_ns, min(self._least[-1], delay_ns)
+        least_ns = min(self._least)
+        self._proven |= now_ns - self._begun_ns >= _PROOF_NS and delay_ns - least_ns <= _NEAR_NS
         return 0 if 0 <= least_ns <= _MOST_DELAY_NS else least_ns
+
+    def _counts_anew(self, camera_ns: int, late_ns: int, now_ns: int) -> bool:
+        # Frames that a network held back are late, but their stamps go on; where they go back, a clock was set.
+        if camera_ns < self._camera_ns:
+            return late_ns > _MOST_SET_NS
+        if late_ns <= _MOST_BEHIND_NS:
+            self._held_ns = 0
+            return late_ns < -_MOST_BEHIND_NS
+        if self._held_ns == 0 or late_ns < self._held_ns:
+            self._held_ns, self._fell_ns = late_ns, now_ns
+        return not self._proven or now_ns - self._fell_ns > _HELD_NS

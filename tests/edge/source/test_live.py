@@ -79,18 +79,30 @@ def test_camera_times_without_jitter_and_never_back():
     assert clock.capture_ns(None, now_ns=zero + 400 * MS) == zero + 400 * MS
 
 
-@pytest.mark.parametrize(("fps", "again_s"), [(30, 4.0), (30, 5.2), (0.8, 5.0)])
-def test_frames_that_a_network_held_back_are_as_old_as_they_are(fps, again_s):
+@pytest.mark.parametrize(
+    ("fps", "stall_s", "again_s", "held_s"),
+    [(30, 4, 4.0, 1.3), (30, 4, 5.2, 1.3), (0.8, 4, 5.0, 1.3), (30, 12, 12.0, 8.0), (0.8, 12, 12.5, 3.0)],
+)
+def test_frames_that_a_network_held_back_are_as_old_as_they_are(fps, stall_s, again_s, held_s):
     """Boxes of before a stall would lie where the camera looked behind it, and old pictures be called live."""
     clock, zero = CameraClock(), 1_000_000 * SECOND_NS
     for number in range(
-        int(10 * fps)
-    ):  # those of 4 s and later come 1.3 s late at first, at twice their rate
+        int(40 * fps)
+    ):  # those of the stall and later come late at first, at twice their rate
         taken_ns = int(number * SECOND_NS / fps)
-        late_ns = max(0, 1300 * MS - (taken_ns - int(again_s * SECOND_NS)) // 2)
-        if not 4 <= taken_ns / SECOND_NS < again_s:  # the camera dropped these
-            come_ns = zero + taken_ns + (late_ns if taken_ns >= 4 * SECOND_NS else 0)
+        late_ns = max(0, int(held_s * SECOND_NS) - (taken_ns - int(again_s * SECOND_NS)) // 2)
+        if not stall_s <= taken_ns / SECOND_NS < again_s:  # the camera dropped these
+            come_ns = zero + taken_ns + (late_ns if taken_ns >= stall_s * SECOND_NS else 0)
             assert clock.capture_ns(taken_ns, now_ns=come_ns) == zero + taken_ns
+
+
+def test_a_camera_whose_stamps_stood_still_is_not_old_for_ever():
+    """Its encoder paused and goes on to number its frames: each later picture would be as old as the pause."""
+    clock, zero = CameraClock(), 1_000_000 * SECOND_NS
+    for number in range(30 * 10):
+        now_ns = zero + number * SECOND_NS // 10 + (3 * SECOND_NS if number >= 150 else 0)
+        at_ns = clock.capture_ns(number * SECOND_NS // 10, now_ns=now_ns)
+    assert at_ns == now_ns
 
 
 def test_a_camera_that_says_its_time_late_stops_no_picture():
@@ -147,6 +159,30 @@ def test_a_camera_that_was_away_and_says_other_times_stops_no_picture(quick):
         assert source.passed_over == 0
         (*_, newest) = (next(source.steps(start_ns=0)) for _ in range(source.pending))
     assert camera.now_ns - newest.capture_ns == 4 * SECOND_NS, "it has come to what the camera says"
+
+
+class HeldBack(SaysItsTimeLater):
+    """It counts from its own start; after 20 s its connection breaks, and the frames of 3 s come at once."""
+
+    def grab(self) -> Shot:
+        if self.given == 114:
+            self.ended.set()
+            raise SignalLost("it is gone")
+        self.given += 1
+        if self.given == 101:
+            self.now_ns += 3 * SECOND_NS
+            raise SignalLost("it went away")
+        self.now_ns += SECOND_NS // 5 if self.given <= 100 else 0
+        return self.shot(self.given * SECOND_NS // 5)
+
+
+def test_frames_that_came_only_with_a_new_connection_are_as_old_as_they_are(quick):
+    """The ground would show pictures of seconds ago as live, right after each gap."""
+    camera = HeldBack()
+    with LiveSource(camera, SMALL, clock=lambda: camera.now_ns) as source:
+        assert camera.ended.wait(60)
+        (*_, newest) = (next(source.steps(start_ns=0)) for _ in range(source.pending))
+    assert camera.now_ns - newest.capture_ns == SECOND_NS // 5
 
 
 def test_a_camera_that_goes_away_is_told_of_and_comes_back(free_port, caplog, quick):
