@@ -77,11 +77,16 @@ def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps, soon_s, m
 
 
 @pytest.mark.parametrize(
-    ("budget", "steps"), [(1_400_000, [(0, 6e4)]), (800_000, [(0, 6e4), (20, 0), (40, 6e4)])]
+    ("budget", "way_s", "steps"),
+    [
+        (1_400_000, 0.3, [(0, 6e4)]),
+        (800_000, 0.3, [(0, 6e4), (20, 0), (40, 6e4)]),
+        (5_000_000, 0.02, [(0, 6e6), (20, 4e4)]),
+    ],
 )
-def test_a_queue_of_many_seconds_is_emptied_and_taken_for_no_longer_route(budget, steps):
+def test_a_queue_of_many_seconds_is_emptied_and_taken_for_no_longer_route(budget, way_s, steps):
     """Below the floor each picture would be half a minute old for the whole flight, and the next older still."""
-    flight = flown(80, *steps, size=(1280, 720), budget=budget, way_s=lambda _second: 0.3)
+    flight = flown(80, *steps, size=(1280, 720), budget=budget, way_s=lambda _second: way_s)
     assert max(flight.delays_between(65, 80)) < 4
     assert flight.longest_hole(65, 80) < 2
 
