@@ -190,7 +190,7 @@ def _edge(one: EdgeState, state: GroundState) -> dict[str, Any]:
     if session is None:
         return said | _NO_SESSION
     at_edge = [(part, _failure(part_words(part.part), part, state.at_ns)) for part in session.edge_failed]
-    failed += [f"at the edge: {words}" for _, words in at_edge]
+    failed += [*session.behind, *(f"at the edge: {words}" for _, words in at_edge)]
     short = [words for part, words in at_edge if part.part == "source"]
     if session.total_bps is not None:
         thin = "link or machine too slow, " if one.link == "thin" else ""

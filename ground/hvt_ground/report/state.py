@@ -174,6 +174,8 @@ class SessionState:
     backlog_video_s: float = _of(lambda at: at.session.backlog.totals.video_s)
     backlog_working: int = _of(lambda at: at.backlog.working)
     """Objects of the backlog that have come and are not where they belong yet."""
+    behind_s: Mapping[str, float] = _of(lambda at: at.session.behind_s)
+    """By recording or other output that is late: the age of its oldest event that is not written."""
     edge_frames: FrameAccount | None = _counted(  # noqa: RUF009 - likewise
         lambda status: status.frame_account if status.frames else None
     )
@@ -186,6 +188,10 @@ class SessionState:
     edge_detect_ms: float | None = _edge(lambda health: health.detect_ms or None)
     edge_still_queue: int | None = _edge(lambda health: health.still_queue)
     edge_failed: tuple[FailedPart, ...] = _of(_failed_at_edge)
+
+    @property
+    def behind(self) -> list[str]:
+        return [f"{part} is behind by {late_s:.0f} s" for part, late_s in self.behind_s.items()]
 
 
 @dataclass(frozen=True, slots=True)

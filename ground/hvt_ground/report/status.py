@@ -52,7 +52,8 @@ def _edge_text(one: EdgeState) -> str:
             f"tracks {session.tracks}, {session.tracks_refined} refined{age}"
             f"{'  UNKNOWN VIEW' if session.view_unlike else ''}"
         )
-    return "  ".join([said, *map(failed_text, one.failed)])
+    behind = [] if session is None else session.behind
+    return "  ".join([said, *behind, *map(failed_text, one.failed)])
 
 
 def summary(session: Session) -> dict[str, Any]:

@@ -100,7 +100,8 @@ class QueuedSink(Generic[T]):
         """The functions to call when this many items are written."""
         self._queued_bytes = 0
         self._skipped = 0
-        self._in_hand = False
+        self._in_hand, self._came_s = False, 0.0
+        """Whether an item is being written, and when the last one of them came."""
         self._ending = False
         self._hurry = threading.Event()
         self._failures = failures
@@ -204,6 +205,13 @@ class QueuedSink(Generic[T]):
             return True
         return len(self._queue) < _MOST_ITEMS and self._queued_bytes + size <= _MOST_BYTES
 
+    @property
+    def behind_s(self) -> float:
+        """For how long the oldest item waits that is not written yet; 0 where none does."""
+        with self._changed:
+            came_s = self._came_s if self._in_hand else self._queue[0][3] if self._queue else None
+        return 0.0 if came_s is None else time.monotonic() - came_s
+
     # In its own thread
 
     def _run(self, open_sink: Callable[[], SinkWriter[T]]) -> None:
@@ -258,12 +266,12 @@ class QueuedSink(Generic[T]):
             self._changed.wait_for(lambda: self._queue or self._ending)
             if not self._queue:
                 return None
-            item, size, skipped, came_s = self._queue.popleft()
+            item, size, skipped, self._came_s = self._queue.popleft()
             self._queued_bytes -= size
             self._in_hand = True
             if self._wait_s:
                 self._changed.notify_all()
-        if (behind_s := time.monotonic() - came_s) >= self._behind_s:
+        if (behind_s := time.monotonic() - self._came_s) >= self._behind_s:
             self._behind_s = 2 * behind_s
             _log.warning("%s is too slow: it is %d s behind, which a kill would lose", self.part, behind_s)
         elif behind_s < BEHIND_S / 2:

@@ -25,7 +25,7 @@ from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
-from hvt_ground.sinks import Outputs
+from hvt_ground.sinks import Outputs, QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_web.feed import SessionFeed, state_message
 from hvt_web.viewers import EdgePage
@@ -148,6 +148,17 @@ def test_who_gets_no_stills_reads_why(ground):
     assert met == "3; stills met 1 of them and changed the ground's own class 2 times"
     events = [text for _, _, text in Recording(ground.path).events()]
     assert f"the edge did not send these stills: {said}" in events
+
+
+def test_a_recording_that_is_behind_is_told_on_line_and_page(ground, monkeypatch):
+    """The log alone told that a kill would lose half a minute of it."""
+    monkeypatch.setattr(QueuedSink, "behind_s", 37.4)
+    state = ground.state()
+    assert "  recording of uav-1 is behind by 37 s  " in status_text(state)
+    shown = json.loads(state_message(state))["edges"]["uav-1"]["failed"]
+    assert "recording of uav-1 is behind by 37 s" in shown
+    monkeypatch.setattr(QueuedSink, "behind_s", 1.0)
+    assert "behind" not in ground.line()
 
 
 def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monkeypatch, capsys):

@@ -73,10 +73,12 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(pipe, failures, caplog, mon
     assert sink.missing == 10_000 - 4096
     assert "tracks table is too slow: 4096 events were dropped so far" in caplog.messages
     assert not sink.idle
+    assert sink.behind_s > 0
     with pipe.open() as reader:
         sink.close()
         lines = reader.read().splitlines()
     assert sink.join(time.monotonic() + 60)
+    assert sink.behind_s == 0
     assert lines == ["a", *["x" * 100] * 4096], "what was taken is written, in whole lines"
     assert re.search(r"tracks table is too slow: it is \d+ s behind, which a kill would lose\n", caplog.text)
     assert failures.parts == (), "slow is not broken"
