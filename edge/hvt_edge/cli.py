@@ -60,7 +60,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(redaction.text(to_toml(config)), end="")
         return 0
     config = check(config)
-    from hvt_common.runtime.reporting import print_table, reported, write_json  # noqa: PLC0415
+    from hvt_common.runtime.reporting import print_table, reported, version_of, write_json  # noqa: PLC0415
     from hvt_edge.app import Edge  # noqa: PLC0415
     from hvt_edge.report.status import in_vain, table, title  # noqa: PLC0415
     from hvt_edge.world import World  # noqa: PLC0415
@@ -79,7 +79,7 @@ def _run(argv: Sequence[str] | None) -> int:
     )
     if note := note_on_share(config, given=given.values):
         logging.getLogger(START_LOGGER).info("%s", note)
-    stop = stop_on_signals()
+    stop, before = stop_on_signals(), version_of(config.summary)
 
     def report(summary: dict[str, Any]) -> None:
         content = redaction.value(summary)
@@ -88,7 +88,7 @@ def _run(argv: Sequence[str] | None) -> int:
         else:
             print_table(title(content), table(content))
         if config.summary is not None:
-            write_json(config.summary, content)
+            write_json(config.summary, content, before=before)
 
     with log.ending():
         edge = Edge(config, stop=stop, on_started=log.release, world=world)

@@ -72,14 +72,14 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = checked(config)
     with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
-        from hvt_common.runtime.reporting import reported, write_json  # noqa: PLC0415
+        from hvt_common.runtime.reporting import reported, version_of, write_json  # noqa: PLC0415
         from hvt_ground.app import Ground  # noqa: PLC0415
         from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
     limit_malloc_arenas()
     put_video_first()
     leave_out_pandas()
     log = start_log("hvt-ground", quiet=config.quiet, form=config.log_format, redaction=redaction)
-    stop = stop_on_signals()
+    stop, before = stop_on_signals(), version_of(config.summary)
 
     def report(summaries: list[dict[str, Any]]) -> None:
         sessions = redaction.value(summaries)
@@ -88,7 +88,7 @@ def _run(argv: Sequence[str] | None) -> int:
         else:
             _print(sessions)
         if config.summary is not None:
-            write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
+            write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions, before=before)
 
     with log.ending():
         ground = Ground(config, stop=stop, on_started=log.release)

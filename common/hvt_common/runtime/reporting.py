@@ -1,9 +1,11 @@
 """The report of a run: a status line, at its end a table and a JSON file; and the findings of a check before it."""
 
 import contextlib
+import itertools
 import json
 import logging
 import os
+import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,9 +18,11 @@ from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read, telling
-from hvt_common.files import write_whole
+from hvt_common.files import claim_name, write_whole
 from hvt_common.runtime.log import STATUS_LOGGER
 from hvt_common.units import shown_text
+
+_log = logging.getLogger(__name__)
 
 _PLAIN_EVERY = 5
 _MOST_NAME_BYTES = 190
@@ -158,9 +162,30 @@ def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) 
             real.unlink()
 
 
-def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
-    """Write the summary, as `write_whole`. Raises `FlightError` where it cannot be written."""
+def write_json(
+    path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, before: object = None
+) -> None:
+    """Write the summary, as `write_whole`. Raises `FlightError` where it cannot be written.
+
+    ``before`` is `version_of` the file as the run began: a file that another run has written since is kept, and this
+    one gets the next free name.
+    """
     try:
+        if before is not None and version_of(path) not in (before, ()):
+            names = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in itertools.count(2))
+            other, path = path, next(one for one in names if claim_name(one))
+            _log.warning("another run has written %s meanwhile: this summary is in %s", other, path)
         write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
     except OSError as error:
         raise FlightError(f"{path} cannot be written ({error.strerror})") from error
+
+
+def version_of(path: Path | None) -> tuple[int, ...]:
+    """Another value once a regular file was written anew; empty where there is none."""
+    try:
+        found = None if path is None else path.stat()
+    except OSError:
+        found = None
+    if found is None or not stat.S_ISREG(found.st_mode):
+        return ()
+    return found.st_ino, found.st_mtime_ns, found.st_size

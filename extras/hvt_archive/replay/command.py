@@ -36,7 +36,7 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.runtime.process import stop_on_signals
-from hvt_common.runtime.reporting import print_table, write_json
+from hvt_common.runtime.reporting import print_table, version_of, write_json
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import parameter_sets
@@ -165,7 +165,7 @@ def run(argv: Sequence[str]) -> int:
         config = replace(config, provider="cpu")
     config = checked(config)
     check_outputs(config, reads=files)
-    replay = _Replay(config, messages, speed=given.speed)
+    replay, before = _Replay(config, messages, speed=given.speed), version_of(config.summary)
     sessions = replay.run()
     if not (sessions or replay.stop.is_set()):
         raise UserError(
@@ -174,7 +174,7 @@ def run(argv: Sequence[str]) -> int:
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if config.summary is not None:
-        write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
+        write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions, before=before)
     return 0
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from hvt_common import files
 from hvt_common.errors import FlightError, UserError, exit_with_sentence
-from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, write_json
+from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, version_of, write_json
 
 
 def test_the_summary_file_is_written_whole(tmp_path):
@@ -41,6 +41,18 @@ def test_a_summary_goes_into_a_pipe_and_through_a_link(tmp_path):
         write_json(link, {"frames": frames})
         assert link.is_symlink()
         assert json.loads(file.read_text()) == {"frames": frames}
+
+
+def test_of_two_runs_at_once_none_loses_its_summary(tmp_path, caplog):
+    """The second ground of a script would replace the first one's; a script that runs again replaces the old one."""
+    path, second = tmp_path / "summary.json", tmp_path / "summary-2.json"
+    for number in (1, 2):
+        before = version_of(path)
+        write_json(path, {"run": number}, before=before)
+        assert not second.exists()
+    write_json(path, {"run": 3}, before=before)
+    assert [json.loads(one.read_text())["run"] for one in (path, second)] == [2, 3]
+    assert caplog.messages == [f"another run has written {path} meanwhile: this summary is in {second}"]
 
 
 def test_a_summary_on_standard_output_stands_behind_what_was_printed(tmp_path):
