@@ -33,16 +33,16 @@ _MOST_S = 100.0
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
     ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 20),
-    ("StillStage.analyze",): ("a frame's objects at the edge", 27),
+    ("StillStage.analyze",): ("a frame's objects at the edge", 25),
     ("StillStage.send",): ("a still at the edge, from choosing to put", 26),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
-        33,
+        32,
     ),
     ("EdgeSessions.handle",): ("a message at the ground, received", 34),
     ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 26),
-    ("Pipeline.analyze",): ("a frame at the ground, analyzed", 30),
-    ("Recorder.log",): ("an event at the ground, recorded and written", 14),
+    ("Pipeline.analyze",): ("a frame at the ground, analyzed", 27),
+    ("Recorder.log",): ("an event at the ground, recorded and written", 12),
 }
 _MEASURED = {one for functions in _WALKS for one in functions}
 _GOES, _KEYFRAME = "Transmitter.still", "BaseStage._at_keyframe"

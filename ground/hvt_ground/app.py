@@ -29,13 +29,12 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
 from hvt_ground.extras import Service, extras_of, part_of
-from hvt_ground.link.group import Group
 from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
 from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
-from hvt_ground.session.subscribe import GroundLink
+from hvt_ground.session.subscribe import GroundLink, Group
 from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.wiring import (
     Models,

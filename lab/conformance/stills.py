@@ -17,8 +17,13 @@ import numpy as np
 from hvt_common.values import Image, View
 from hvt_common.video.base_crop import exact_base_crop
 from hvt_common.video.still_codecs import Parameters, still_codec, still_codec_names
-from hvt_common.video.still_codecs.h264_intra import decoded, split_payload
-from hvt_common.video.still_codecs.h264_syntax import coded_slice, parameter_sets, verbatim_picture
+from hvt_common.video.still_codecs.h264_intra import (
+    coded_slice,
+    decoded,
+    parameter_sets,
+    split_payload,
+    verbatim_picture,
+)
 from hvt_common.video.still_codecs.yuv420 import Planar, padded_size, to_planar
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "conformance" / "stills.json"

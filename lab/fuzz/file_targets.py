@@ -1,15 +1,19 @@
-"""Files from elsewhere: poses beside a clip, and the log of another ground."""
+"""Files from elsewhere: poses beside a clip, the log of another ground, and models."""
 
 import contextlib
 import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from hvt_archive.replay.message_log import MessageLog, read_log
 from hvt_common.errors import UserError
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.transport.inbox import Received
 from hvt_geo.pose.files import read_poses
 from lab.fuzz.contract import Target, scratch
+from media.onnx_models import colour_classifier, constant_model
 from rigs import messages
 
 _TABLE = (
@@ -63,9 +67,22 @@ def _log_seed() -> bytes:
     return path.read_bytes()
 
 
+def _model(data: bytes) -> None:
+    path = scratch() / "m.onnx"
+    path.write_bytes(data)
+    with contextlib.suppress(UserError):
+        open_model(path, settings=ModelSettings(threads=1))
+
+
+def _seeds() -> list[bytes]:
+    small = constant_model(scratch() / "seed.onnx", np.ones((1, 2), np.float32), metadata={"names": "['a']"})
+    return [small.read_bytes(), colour_classifier(scratch() / "seed.onnx").read_bytes()]
+
+
 TARGETS = (
     Target("pose-table", _poses(".csv"), lambda: [_TABLE, _UTC_TABLE], share=10, short=300),
     Target("pose-subtitles", _poses(".srt"), lambda: [_SUBTITLES], share=10, short=300),
     Target("pose-track", _poses(".gpx"), lambda: [_TRACK], share=10, short=300),
     Target("message-log", _log, lambda: [_log_seed()], share=10, short=500),
+    Target("model-file", _model, _seeds, share=8, short=200, most_bytes=2000),
 )

@@ -5,7 +5,6 @@ from lab.fuzz import (
     file_targets,
     ground_target,
     message_targets,
-    model_target,
     picture_targets,
     stage_targets,
     text_targets,
@@ -31,7 +30,6 @@ TARGETS = {
         *text_targets.TARGETS,
         *file_targets.TARGETS,
         *ground_target.TARGETS,
-        *model_target.TARGETS,
         PLANTED,
     )
 }

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from hvt_common.camera_motion import Affine
 from hvt_common.tracking import kalman
-from hvt_common.tracking.matching import duplicates, match
+from hvt_common.tracking.association import duplicates, match
 from hvt_common.tracking.motion import Pictures, Step, move
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.tracking.track_table import (

@@ -67,7 +67,7 @@ class LinkDoctor:
     def sharer(self) -> Callable[..., AbstractContextManager[Any]]:
         """``(session, group, page=…)`` makes this ground a member, which a ``page`` shows to others.
 
-        The context is a `hvt_ground.link.group.Group`. Raises `UserError` where nothing shares.
+        The context is a `hvt_ground.session.subscribe.Group`. Raises `UserError` where nothing shares.
         """
         raise not_installed("--group", "hvt[ground]")
 

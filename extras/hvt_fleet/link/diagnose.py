@@ -21,10 +21,17 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
 from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints, end_of
-from hvt_fleet.link.certificate import SOON_S, TlsFiles, check_own_keys, dated, shown_to_callers
+from hvt_fleet.link.certificate import (
+    SOON_S,
+    Rights,
+    TlsFiles,
+    check_own_keys,
+    dated,
+    refusals,
+    shown_to_callers,
+)
 from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
 from hvt_fleet.link.probe import why_no_link
-from hvt_fleet.link.rights import Rights, refusals
 from hvt_fleet.link.stale_sockets import StaleSockets
 from hvt_fleet.link.strangers import Strangers, listening_ports
 

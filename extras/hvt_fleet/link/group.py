@@ -24,7 +24,7 @@ import zenoh
 from hvt_common.protocol.channels import GroupKeys
 from hvt_common.transport.inbox import TokenBucket
 from hvt_common.units import SECOND_NS
-from hvt_ground.link.group import Elsewhere, Group
+from hvt_ground.session.subscribe import Elsewhere, Group
 
 _log = logging.getLogger(__name__)
 

@@ -1,1 +1,1 @@
-"""Reads foreign exports: `first_steps` on their pixels, the `forms` of their numbers, and `ir`, OpenVINO's files."""
+"""Reads foreign exports: `first_steps` on their pixels, and the `forms` of their numbers."""

@@ -24,7 +24,7 @@ from hvt_ground.events import Event, FrameEvent, Notice, Overlay, VideoSample
 from hvt_ground.recordings.row import FileAccount, RecordingRow
 from hvt_ground.sinks.queued import SinkWriter
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.rerun.recording_file import RecordingFile
+from hvt_ground.sinks.rerun.rrd_file import RecordingFile
 
 _REPORT_S = 10.0
 _SMALL_BYTES, _MOST_SMALL = 128 * 2**10, 8

@@ -17,9 +17,9 @@ from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.events import Traffic
-from hvt_ground.link.group import Elsewhere, Group
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
+from hvt_ground.session.subscribe import Elsewhere, Group
 
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 """``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out that the link does not

@@ -1,12 +1,16 @@
-"""The ground's end of the link: its subscriptions, sorted by edge. Knows Zenoh; knows nothing of frames."""
+"""The ground's end of the link: its subscriptions, sorted by edge. Knows Zenoh; knows nothing of frames.
+
+Grounds may share a fleet as a group: each edge is served by one of them, and by another once that one is gone.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
-from typing import Self
+from typing import Protocol, Self
 
 import zenoh
 
@@ -16,9 +20,37 @@ from hvt_common.runtime.failures import RetryPause, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.session import another_key, subscribe
 from hvt_common.units import SECOND_NS
-from hvt_ground.link.group import Group
 from hvt_ground.perception.stills.decode import readable_codecs
 from hvt_ground.session.edge_port import EdgePort
+
+
+@dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """The member that serves an edge instead of this one."""
+
+    member: str
+    page: str
+    """The address of its page for browsers; empty where it has none, or has not said."""
+
+
+class Group(Protocol):
+    """This ground as a member."""
+
+    member: str
+
+    @property
+    def elsewhere(self) -> Mapping[str, Elsewhere]:
+        """The other member that serves each edge."""
+
+    def serves(self, edge: str) -> bool:
+        """Whether the edge is to be served here now; claims it where it is this member's."""
+
+    def release(self, edge: str) -> None:
+        """It is not served here any more, and may be elsewhere; unless it is this member's again."""
+
+    def forget(self, *, except_for: Iterable[str]) -> None:
+        """Withdraw claims of edges that are gone."""
+
 
 _log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from hvt_common.values import Image
 from hvt_study.commands import output
 from hvt_study.commands.arguments import base_size, check_means, flown_frames, option, parse_rates
 from hvt_study.reading.compared import READ_METHODS, ReadPlan, ReadResult, ReadRow, compare_codes
-from hvt_study.reading.observer import Channel
+from hvt_study.reading.flight import Channel
 from hvt_study.reading.score import Evidence
 from hvt_study.runs.methods import chosen_names
 from hvt_study.runs.spec import ModelChoice

@@ -18,7 +18,7 @@ from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import Source, open_source
 from hvt_edge.source.video import VideoSource
-from hvt_edge.stills.policy.selectors import SELECTORS
+from hvt_edge.stills.policy.paper import SELECTORS
 from hvt_study.commands.arguments import check_whole, option
 from hvt_study.commands.output import check_out, print_columns, writing
 from hvt_study.datasets.annotation_rows import LARGEST

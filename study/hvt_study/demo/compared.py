@@ -21,7 +21,7 @@ from hvt_study.demo.picture import Pair, Panel
 from hvt_study.metrics.classes import ClassScore
 from hvt_study.metrics.judged import FrameView
 from hvt_study.metrics.track_table_score import read_tracks, score
-from hvt_study.reading.observer import INSIDE_SHARE
+from hvt_study.reading.flight import INSIDE_SHARE
 from hvt_study.reading.score import LEAST_VISIBLE, Code, CodeReader, code_crop, codes_to_read, share_inside
 
 

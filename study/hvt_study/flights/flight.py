@@ -37,7 +37,7 @@ from hvt_edge.wiring import base_size
 from hvt_edge.world import World
 from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
-from hvt_study.cache.cached_detector import CachedDetector
+from hvt_study.cache.results import CachedDetector
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights import flight_link
 from hvt_study.flights.flight_ground import GroundSide, InlineExecutor

@@ -34,8 +34,7 @@ from hvt_study.flights.flight import FlightReport, coded_frames, picture_age_p95
 from hvt_study.flights.flight_link import START_NS, LinkReport, frame_ns
 from hvt_study.metrics.judged import FrameView
 from hvt_study.metrics.observed import ObservedFrame
-from hvt_study.peers.dds_edge import DdsEdge, most_stored, pass_rates
-from hvt_study.peers.dds_line import Line
+from hvt_study.peers.dds_edge import DdsEdge, Line, most_stored, pass_rates
 from hvt_study.peers.dds_regions import (
     Blocks,
     DdsSettings,

@@ -13,8 +13,7 @@ from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_study.datasets.layouts.uri import open_datasets
-from hvt_study.reading.flight import ReadFlight, Readings
-from hvt_study.reading.observer import CHANNELS, Channel
+from hvt_study.reading.flight import CHANNELS, Channel, ReadFlight, Readings
 from hvt_study.reading.score import ChannelScore, Code, CodeReader, Evidence, channel_score
 from hvt_study.runs.spec import ModelChoice, RunSpec
 

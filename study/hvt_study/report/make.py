@@ -9,9 +9,13 @@ from hvt_study.report.data.captions import ENOUGH, METRICS, time_of, written
 from hvt_study.report.data.document import Drawing, Part, Report, Section, Table
 from hvt_study.report.data.pairs import Pair, equal_quality, pairs
 from hvt_study.report.example.choice import Example
-from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
+from hvt_study.report.figures.curve_figures import (
+    codec_figure,
+    difference_figures,
+    equal_figures,
+    utility_figure,
+)
 from hvt_study.report.figures.example_figures import crop_pictures, timeline_figure
-from hvt_study.report.figures.pair_figures import difference_figures, equal_figures
 from hvt_study.report.tables import (
     differences_table,
     equal_table,

@@ -28,8 +28,16 @@ from hvt_common.inference.store import MOTION, resolve_model
 from hvt_common.inference.tiles import tiled
 from hvt_common.tracking.settings import weak_confidence
 from hvt_ground.config import DETECTOR, NONE
-from hvt_study.cache.cached_detector import CachedDetector, digest_of_file
-from hvt_study.cache.results import CacheError, ResultCache, content_key, file_digest, flight_code, installed
+from hvt_study.cache.results import (
+    CachedDetector,
+    CacheError,
+    ResultCache,
+    content_key,
+    digest_of_file,
+    file_digest,
+    flight_code,
+    installed,
+)
 from hvt_study.datasets.class_map import ClassMap, joint_classes
 from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels

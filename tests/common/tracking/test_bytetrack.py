@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import assign, larger, overlaps
 from hvt_common.tracking.bytetrack import ByteTracker
-from hvt_common.tracking.flow import box_flow
+from hvt_common.tracking.motion import box_flow
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, iou
 from hvt_study.metrics.tracking import compare_tracks

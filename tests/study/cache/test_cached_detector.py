@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 
 from hvt_common.inference.store import resolve_model
-from hvt_study.cache.cached_detector import CachedDetector
+from hvt_study.cache.results import CachedDetector
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (96, 128, 3), np.uint8)
 

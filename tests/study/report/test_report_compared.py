@@ -18,10 +18,9 @@ from hvt_study.report.data.captions import ENOUGH, interval_of, mean_of
 from hvt_study.report.data.pairs import EqualQuality, pairs
 from hvt_study.report.data.table_file import write_results
 from hvt_study.report.example.choice import CropExample, Example, Timeline, choose_run
-from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
+from hvt_study.report.figures.curve_figures import codec_figure, difference_figures, utility_figure
 from hvt_study.report.figures.drawing import PALETTE, log_axis, rate_axis, style_of
 from hvt_study.report.figures.example_figures import crop_pictures
-from hvt_study.report.figures.pair_figures import difference_figures
 from hvt_study.report.make import make_report
 from hvt_study.report.tables import (
     differences_table,

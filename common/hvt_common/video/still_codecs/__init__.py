@@ -1,8 +1,8 @@
 """Still codecs behind one small contract (`contract.py`); docs/stills.md has the table of them.
 
-A new one is a file beside these and a row in `registry`, or an entry point of a package, as those of the extra
-`hvt_codecs`, which no profile uses. Who makes vectors of stills reaches into
-`h264_intra`, `h264_syntax` and `yuv420`; codecs reach into `contract`.
+A new one is a file beside these and a row at the end of `contract`, or an entry point of a package, as those of the
+extra `hvt_codecs`, which no profile uses. Who makes vectors of stills reaches into `h264_intra` and `yuv420`; codecs
+reach into `contract`.
 """
 
 from hvt_common.video.still_codecs.contract import (
@@ -12,7 +12,8 @@ from hvt_common.video.still_codecs.contract import (
     Parameters,
     StillCodec,
     StillError,
+    still_codec,
+    still_codec_names,
 )
 from hvt_common.video.still_codecs.jpeg import JpegCodec
-from hvt_common.video.still_codecs.registry import still_codec, still_codec_names
 from hvt_common.video.still_codecs.search import best_fitting, psnr_y_db, smallest_reaching

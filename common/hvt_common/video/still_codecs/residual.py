@@ -22,12 +22,15 @@ from hvt_common.video.still_codecs.contract import (
     Parameters,
     qp_of,
 )
-from hvt_common.video.still_codecs.h264_intra import decoded, encoded, split_payload, x264_options
-from hvt_common.video.still_codecs.h264_syntax import (
+from hvt_common.video.still_codecs.h264_intra import (
     cabac_data,
     coded_slice,
+    decoded,
+    encoded,
     parameter_sets,
+    split_payload,
     verbatim_picture,
+    x264_options,
 )
 from hvt_common.video.still_codecs.yuv420 import (
     Planar,

@@ -12,6 +12,7 @@ from hvt_common.errors import UserError
 from hvt_edge.stills.policy.base import Method
 from hvt_edge.stills.policy.m6 import ExpectedGain
 from hvt_edge.stills.policy.paper import (
+    SELECTORS,
     OnStart,
     Periodic,
     Small,
@@ -20,7 +21,6 @@ from hvt_edge.stills.policy.paper import (
     Utility,
     VideoOnly,
 )
-from hvt_edge.stills.policy.selectors import SELECTORS
 
 
 @dataclass(frozen=True, slots=True)

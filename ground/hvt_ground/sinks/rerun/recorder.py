@@ -35,8 +35,7 @@ from hvt_ground.sinks.rerun.overlays import (
     LayerUpdate,
     OverlayEncoder,
 )
-from hvt_ground.sinks.rerun.recording_file import RecordingFile
-from hvt_ground.sinks.rerun.rrd_file import RrdFile
+from hvt_ground.sinks.rerun.rrd_file import RecordingFile, RrdFile
 from hvt_ground.sinks.rerun.sdk import RecordingId
 from hvt_ground.sinks.rerun.stills import StillRows
 from hvt_ground.sinks.rerun.tables import CodedIdentity, LogText, SizeLimit, TableRow

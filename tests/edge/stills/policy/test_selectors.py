@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hvt_edge.stills.policy.paper import SELECTORS
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.policy.selectors import SELECTORS
 from rigs.examples import candidate, decision_step
 
 BY_NAME = {row.name: row for row in SELECTORS}

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hvt_fleet.health.system import SystemReading, read_system
+from hvt_fleet.health.edge_metrics import SystemReading, read_system
 
 WIRELESS = """\
 Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE

@@ -20,10 +20,9 @@ from cryptography.hazmat.primitives import serialization
 from hvt_common.errors import UserError
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
-from hvt_fleet.link.certificate import KeyPair, TlsFiles
+from hvt_fleet.link.certificate import KeyPair, Rights, TlsFiles
 from hvt_fleet.link.diagnose import Watch, visit
 from hvt_fleet.link.probe import why_no_link
-from hvt_fleet.link.rights import Rights
 from hvt_fleet.pki import authority
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.outsider import joined

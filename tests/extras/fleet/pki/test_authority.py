@@ -15,7 +15,7 @@ from cryptography.x509.oid import NameOID
 
 from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import LinkSettings, configure
-from hvt_fleet.link.rights import Rights
+from hvt_fleet.link.certificate import Rights
 from hvt_fleet.pki import authority
 from hvt_fleet.pki.command import run
 from hvt_fleet.pki.roster import Roster

@@ -22,7 +22,7 @@ from hvt_common.protocol.messages.bits import BitWriter
 from hvt_common.values import View
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import JpegCodec, StillError, still_codec, still_codec_names
-from hvt_common.video.still_codecs.h264_syntax import parameter_sets
+from hvt_common.video.still_codecs.h264_intra import parameter_sets
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
