@@ -11,7 +11,6 @@ import argparse
 import dataclasses
 import difflib
 import sys
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -21,11 +20,12 @@ from typing import Any, TypeVar
 import tomli_w
 
 from hvt_common.errors import Parser, UserError, absent, check_not_read, named_path
-from hvt_common.files import read_text
+from hvt_common.files import read_text, toml_table
 from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
 _Config = TypeVar("_Config")
+_MOST_BYTES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,7 +328,7 @@ def _one(given: Any, *, name: str) -> str:
 def _from_file(config_class: type, file: Path) -> dict[str, Any]:
     fields = {field.name.replace("_", "-"): field for field in dataclasses.fields(config_class)}
     try:
-        table = tomllib.loads(read_text(file))
+        table = toml_table(read_text(file, most=_MOST_BYTES))
     except FileNotFoundError:
         raise absent(file)(f"--config {file} does not exist: give a TOML file") from None
     except OSError as error:

@@ -12,17 +12,20 @@ import select
 import stat
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 MOST_BYTES = 16_000_000
 MOST_TABLE_BYTES = 1_000_000_000
 """Limit for labels and annotations of a whole dataset."""
 PIPE_WAIT_S = 10.0
 """The longest wait for a pipe's other end, and then for its content."""
+_MOST_DOTS = 300
+"""In a line of TOML: the time that Python takes for a key grows with the square of its parts, to many minutes."""
 _LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
 _log = logging.getLogger(__name__)
 
@@ -84,6 +87,14 @@ def decoded(content: bytes) -> str:
     """Text in UTF-8, or as its byte order mark says. Raises `UnicodeDecodeError` for anything else."""
     wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return content.decode("utf-16" if wide else "utf-8-sig")
+
+
+def toml_table(text: str) -> dict[str, Any]:
+    """TOML as a table. Raises `ValueError`, also for a line of too many dots, and `RecursionError`."""
+    for number, line in enumerate(text.split("\n"), start=1):
+        if line.count(".") > _MOST_DOTS:
+            raise ValueError(f"line {number} has more than {_MOST_DOTS} dots: no key has so many parts")
+    return tomllib.loads(text)
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -7,7 +7,6 @@ the models that the user added. A table's name is the model's name; its keys are
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from importlib.resources import files
@@ -15,6 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
+from hvt_common.files import toml_table
 
 MAX_SIZE_BYTES = 1 << 30
 """1 GiB, as much as a model may have when it is opened."""
@@ -70,7 +70,7 @@ def builtin_manifest() -> dict[str, ModelEntry]:
 def parse_manifest(text: str, *, origin: str) -> dict[str, ModelEntry]:
     """Read a manifest. Raises `UserError` where it is none, in a sentence that names ``origin``."""
     try:
-        tables = tomllib.loads(text)
+        tables = toml_table(text)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{origin} is not valid TOML ({error})") from error
     return {name: _entry(name, table, origin=origin) for name, table in tables.items()}

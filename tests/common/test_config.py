@@ -113,6 +113,7 @@ def test_what_was_set_is_told_apart_from_what_was_not(tmp_path):
         ("budget = ", "is not valid TOML"),
         ("a = 1\na = 2", "is not valid TOML"),
         pytest.param(f"a = {'[' * 9999}", "is not valid TOML", id="deep"),
+        pytest.param("a." * 99_999 + "b = 1", "line 1 has more than 300 dots", id="a key of many parts"),
     ],
 )
 def test_a_wrong_file_is_one_sentence(tmp_path, text, said):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 from hvt_common.errors import UserError, absent
-from hvt_common.files import read_text
+from hvt_common.files import read_text, toml_table
 from hvt_common.inference.class_names import kind_of
 from hvt_common.units import utc_text
 
@@ -62,7 +61,7 @@ class TypeTable:
 def default_types() -> TypeTable:
     """The table of ``types.toml`` beside this file."""
     text = (files("hvt_gateways.cot") / "types.toml").read_text(encoding="utf-8")
-    return _parsed(tomllib.loads(text), where="types.toml")
+    return _parsed(toml_table(text), where="types.toml")
 
 
 def read_types(path: Path | None) -> TypeTable:
@@ -71,7 +70,7 @@ def read_types(path: Path | None) -> TypeTable:
     if path is None:
         return table
     try:
-        content = tomllib.loads(read_text(path, most=_MOST_BYTES))
+        content = toml_table(read_text(path, most=_MOST_BYTES))
     except OSError as error:
         raise absent(path)(
             f"--cot-types {path} cannot be read ({error.strerror}): give a table of types, TOML"
