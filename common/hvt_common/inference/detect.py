@@ -47,6 +47,8 @@ _THERMAL_SHARE, _SECOND_SHARE = 0.65, 0.76
 """A small picture without colour is enlarged to this share of that side: larger, 640x512 shows people that are none.
 The second network of a file is silent there; a second run, at this share of the size, agrees instead (`averaged`).
 """
+_CONTRAST = 64
+"""Of a picture in which a network's scores differ from place to place."""
 _BROKEN = 0.1
 """Where no more of an answer is no number, that is some cells; the scores of one class are a fifth."""
 _TWIN_IOU = 0.8
@@ -219,6 +221,7 @@ class OnnxDetector:
         )
         self._group_ids = _group_ids(self.class_names)
         self._are_names, self._beyond_said = names is not None, False
+        self._scores_looked_at = not self.head.suppresses
         self._letterboxer = Letterboxer(
             anchor=self.head.anchor,
             preparation=self.preparation,
@@ -292,6 +295,16 @@ class OnnxDetector:
             found = self.head.decode(outputs, confidence=least, input_size=input_size)
         except UserError as error:
             raise UserError(f"model {self.model.path} {error}") from None
+        if not self._scores_looked_at and int(image.max()) - int(image.min()) > _CONTRAST:
+            self._scores_looked_at = True
+            scores = self.head.decode(outputs, confidence=0.0, input_size=input_size).scores
+            if not len(scores) or scores.min() == scores.max():
+                _log.warning(
+                    "%s gives all places of a picture the score %.3g, and can tell no object: if it was made smaller"
+                    " (INT8), boxes and scores need a scale each, else a detector of floating point is accepted",
+                    self.model.path.name,
+                    max(scores, default=0.0),
+                )
         used = [outputs[index] for index in self.head.outputs]
         if not len(found.scores) and any(np.isnan(one).sum() > _BROKEN * one.size for one in used):
             raise UserError(f"model {self.model.path} answers a picture with what is no number (NaN)")

@@ -15,7 +15,7 @@ from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.runtimes.model import OnnxModel, Port, open_model
 from hvt_common.inference.runtimes.providers import ProviderChoice
 from media.head_models import FAMILIES, NEEDS_NAMES, SQUARES, Graph, family_model, picture
-from media.onnx_models import constant_model, save, scaling_inside
+from media.onnx_models import cells, constant_model, save, scaling_inside
 
 NAMED = {"names": "['red', 'blue']"}
 ULTRALYTICS = {**NAMED, "author": "Ultralytics", "task": "detect", "stride": "32", "imgsz": "[320, 320]"}
@@ -378,6 +378,23 @@ def test_a_class_beyond_the_names_is_said_once(tmp_path: Path, caplog) -> None:
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 1
     assert "lists class 7, and has names up to class 1" in said[0]
+
+
+@pytest.mark.parametrize("score", [0.0, 0.4])
+def test_scores_that_are_all_alike_are_said_once(tmp_path: Path, caplog, score: float) -> None:
+    """With one INT8 scale for pixels and scores each score is 0: nothing was found, and nobody knew why."""
+    columns, rows, strides = cells((64, 64)).T
+    table = np.full((1, 7, len(columns)), score)
+    table[0, :4] = (columns + 0.5) * strides, (rows + 0.5) * strides, strides, strides
+    detector = opened(constant_model(tmp_path / "m.onnx", table), head="yolov8")
+    caplog.clear()
+    for shown in (
+        np.zeros((64, 64, 3), np.uint8),
+        *[np.eye(64, dtype=np.uint8)[..., None].repeat(3, 2) * 255] * 2,
+    ):
+        detector.detect(shown)
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert f"gives all places of a picture the score {score:.3g}, and can tell no object" in said
 
 
 @pytest.mark.parametrize("said", [{}, {"stride": "64"}])
