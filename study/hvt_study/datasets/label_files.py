@@ -69,7 +69,8 @@ _CLASSES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml")
 _COCO = ("labels.json", "result.json", "annotations.json", "_annotations.coco.json", "coco.json")
 _COCO_BOXES = "instances_"
 """COCO's own name for the file with boxes, beside captions and keypoints of the same pictures; CVAT's too."""
-_COCO_WORDS = "captions_"
+_NO_LABELS = ("captions_", "detections.csv")
+"""How names of COCO's texts begin, and the name of what ``hvt-study detect`` writes."""
 _DEPTH = 3
 
 
@@ -183,7 +184,7 @@ def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) ->
 
 def _may_hold_labels(path: Path, known: Container[Path]) -> bool:
     named = path.suffix.lower() in (*_OTHER_FILES, *_OTHER_TABLES, ".txt")
-    return named and path not in known and not path.name.startswith(_COCO_WORDS) and path.is_file()
+    return named and path not in known and not path.name.startswith(_NO_LABELS) and path.is_file()
 
 
 def _holds_camera_poses(path: Path) -> bool:

@@ -103,7 +103,10 @@ LAYOUTS = {
         {"labels/val/a.txt": ROW, "dataset.yaml": "names:\n- car\n- bus\nnc: 2\n"},
     ),
     "FiftyOne, COCODetectionDataset": ("data/a.jpg", {"labels.json": coco()}),
-    "labelImg": ("a.jpg", {"a.txt": ROW, "classes.txt": CLASSES}),
+    "labelImg, detected on before": (
+        "a.jpg",
+        {"a.txt": ROW, "classes.txt": CLASSES, "out/detections.csv": "a.jpg,20,10,80,60,0.9,bus\n"},
+    ),
     "labelImg, VOC": ("a.jpg", {"a.xml": (voc(), "utf-8-sig")}),
     "Esri, VOC": ("images/a.jpg", {"labels/a.xml": voc().replace("<x", "<X").replace("</x", "</X")}),
     "CVAT, YOLO 1.1": ("obj_train_data/a.jpg", {"obj_train_data/a.txt": ROW, "obj.names": CLASSES}),
