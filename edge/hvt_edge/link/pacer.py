@@ -496,7 +496,9 @@ class Pacer:
             return False
         self._controller.on_silence(now_ns)
         self._give_up_all()
-        if not self._lossy:
+        if (
+            not self._lossy and now_ns - reported_ns <= _GIVEN_UP_NS
+        ):  # else both ways are gone, and no queue stands
             self._drain_to, self._doubtful = self._given_up, True
         return True
 
