@@ -444,6 +444,8 @@ class Pacer:
                 self._flight.clear()
                 if self._reported_ns is not None:
                     self._controller.on_silence(now_ns)
+                if self._controller.gone():
+                    self._began_ns = None
                 self._leave()
             reported_ns = self._reported_ns if there else None
             lost = reported_ns is not None and (self._give_up(now_ns, reported_ns) or self._probes(now_ns))
