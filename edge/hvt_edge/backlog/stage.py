@@ -157,8 +157,6 @@ class BacklogStage:
         self.frames = 0
         """Frames stored to be sent later; they include those also sent as probes of whether the link is back."""
         self.max_bytes = store.max_bytes
-        self.finer = False
-        """No link limits the rate any more: stored video is opened at the budget's with its next keyframe."""
         self.breaks = 0
         """How often the messages in flight have been declared lost."""
         self.worker = StoreWorker(

@@ -48,7 +48,7 @@ _LATE_NS = 3 * SECOND_NS
 _QUEUE_NS = SECOND_NS
 """Where two named in a row came later than this, those behind them stand in a queue that must empty first, …"""
 _STALL_NS = SECOND_NS
-"""… unless none has come for this long, and four times that which the next takes at the rate: they are lost."""
+"""… unless none of them has come for this long: they are lost."""
 _MEMORY_NS = 15 * SECOND_NS
 """What was measured counts for this long."""
 _MOST_RECORDS = 1024
@@ -272,8 +272,8 @@ class Pacer:
         """Shortest time from sending a message to its report; half a second until one was measured."""
         self._return_ns = 0
         """Shortest travel time of a report, plus the difference of the clocks."""
-        self._given_up, self._doubtful = -1, False
-        """The newest base message that was declared lost, and whether none has been named since."""
+        self._given_up = -1
+        """The newest base message that was declared lost."""
         self._lossy = False
         """Whether overdue messages are likely lost, as they were the last time."""
         self._lost = 0
@@ -389,7 +389,7 @@ class Pacer:
                 self._give_up_all()
             if sent is None:
                 return
-            self._progress_ns, self._doubtful = now_ns, False
+            self._progress_ns = now_ns
             return_ns, held_ns = now_ns - feedback.send_ns, 1000 * feedback.base_held_us
             late_back_ns = 0 if self._return.empty else max(0, return_ns - self._return_ns)
             queued_before = self._queued
@@ -444,8 +444,6 @@ class Pacer:
                 self._flight.clear()
                 if self._reported_ns is not None:
                     self._controller.on_silence(now_ns)
-                if self._controller.gone():
-                    self._began_ns = None
                 self._leave()
             reported_ns = self._reported_ns if there else None
             lost = reported_ns is not None and (self._give_up(now_ns, reported_ns) or self._probes(now_ns))
@@ -458,8 +456,7 @@ class Pacer:
         with self._lock:
             # Stored frames have the former rate: they would delay live video when the link is back.
             carries_ns = 8 * SECOND_NS * self._last_bytes // self.rate_bps
-            since_ns = now_ns - self._last_sent_ns
-            probes = since_ns >= max(_PROBE_NS, carries_ns)
+            probes = now_ns - self._last_sent_ns >= max(_PROBE_NS, carries_ns)
             if self._reported_ns is None:
                 return self._may_start(now_ns) or probes
             if now_ns - self._reported_ns > _FORGET_NS and self._linked:
@@ -468,9 +465,6 @@ class Pacer:
             self._give_up(now_ns, self._reported_ns)
             if now_ns - self._reported_ns > _SILENCE_NS:
                 return probes
-            if self._drains(now_ns):
-                # Until one of them comes they may be lost all the same.
-                return self._doubtful and since_ns >= max(_PROBE_NS, 4 * carries_ns)
             return self._is_open(now_ns, _MOST_BACKLOG_NS + coding_ns) or self._probes(now_ns)
 
     def holds(self, now_ns: int) -> bool:
@@ -498,10 +492,6 @@ class Pacer:
             return False
         self._controller.on_silence(now_ns)
         self._give_up_all()
-        if (
-            not self._lossy and now_ns - reported_ns <= _GIVEN_UP_NS
-        ):  # else both ways are gone, and no queue stands
-            self._drain_to, self._doubtful = self._given_up, True
         return True
 
     def _give_up_all(self) -> None:
@@ -514,18 +504,11 @@ class Pacer:
         return not _START_NS <= now_ns - self._started_ns < _START_NS + _START_HOLD_NS
 
     def _is_open(self, now_ns: int, most_backlog_ns: int) -> bool:
-        if self._drains(now_ns):
+        due = self._flight.next_due
+        if due is not None and due.sequence <= self._drain_to and now_ns - self._progress_ns <= _STALL_NS:
             return False
         backlog_ns = self._flight.backlog_ns(now_ns=now_ns, rate_bps=self.rate_bps)
         return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= self._slack_ns
-
-    def _drains(self, now_ns: int) -> bool:
-        # Whether messages stand in a queue, which must empty first.
-        due = self._flight.next_due
-        if due is None or due.sequence > self._drain_to:
-            return False
-        carries_ns = 0 if self._lossy else 8 * SECOND_NS * due.line_bytes // self.rate_bps
-        return now_ns - self._progress_ns <= _STALL_NS + 4 * carries_ns
 
     def _note_losses(self, feedback: Feedback, now_ns: int) -> None:
         # An overdue message that still came was late: it stood in a queue, and further probes would lengthen that.

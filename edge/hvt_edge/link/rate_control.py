@@ -207,7 +207,7 @@ class RateController:
         self._curve_ns = 2**62
         """Time along the curve of growth; only time without signs of congestion counts."""
         self._last_ns: int | None = None
-        self._silent = self._unfound = False
+        self._silent = False
         self._losses = LossCount()
         self._next_loss_ns = 0
         self.backoffs = 0
@@ -243,7 +243,7 @@ class RateController:
         excess_ns = self._excess(progress)
         if progress.sent_ns < self._judge_from_ns:
             return
-        self._silent = self._unfound = False
+        self._silent = False
         self._recent.append((progress, excess_ns))
         self._losses.add(progress.messages, progress.lost)
         limit_ns = self._limit_ns()
@@ -282,7 +282,7 @@ class RateController:
     def on_silence(self, now_ns: int) -> None:
         """Reports have stopped: the rate falls to the floor. When they return it nears the former rate quickly."""
         if not self._silent:
-            self._silent, self._unfound = True, self.begins
+            self._silent = True
             if self._curve_ns >= self._plateau_ns:  # else it is still on its way back
                 self._cubic_max = self._rate
             self._climb_from(self._floor_bps, plateau_ns=_RESUME_NS)
@@ -290,15 +290,6 @@ class RateController:
             self._losses.clear()  # losses while a link is away are no property of it
             self._start_over(now_ns)
         self._last_ns = now_ns
-
-    def gone(self) -> bool:
-        """The link is gone. Where its rate was never found nothing limits it now: True, and the next one begins."""
-        unfound = self._unfound or self.begins
-        if unfound:
-            self._rate = self._cubic_max = float(self.ceiling_bps)
-            self._plateau_ns, self._curve_ns = _PLATEAU_NS, 2**62
-            self._unfound = self._silent = False
-        return unfound
 
     def _climb_from(self, rate: float, *, plateau_ns: int) -> None:
         self._rate = self._low = float(rate)

@@ -255,10 +255,8 @@ class LinkControl:
         if self.pacer is None:
             return
         back = self.pacer.link(linked, reports=ground, now_ns=now_ns)
-        if offline and self.backlog is not None:  # stored objects have the quality that the link had
-            self.backlog.finer = self.reconfiguration.hold(now_ns) and not linked
-            if self.backlog.finer:
-                self.keyframes.require(now_ns)
+        if offline:  # stored objects have the quality that the link had
+            self.reconfiguration.hold(now_ns)
         if offline or not linked:  # nothing is carried anywhere
             return
         if self.reconfiguration.track_link(now_ns) or back:

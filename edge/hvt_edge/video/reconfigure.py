@@ -106,17 +106,15 @@ class EncoderReconfiguration:
             wanted_bps, self.operating.now.base_bps, at_ceiling=self.pacer.at_ceiling, now_ns=now_ns
         )
 
-    def hold(self, now_ns: int) -> bool:
+    def hold(self, now_ns: int) -> None:
         """While the link is offline: stored messages have the budget for which the base stream was opened.
 
         The pacer takes the silence for a link that carries next to nothing; stills would find no room in the store.
-        True where it knows no limit, and the base stream was opened for much less: that of a flight's beginning.
         """
         if self.pacer is None:
-            return False
+            return
         now = self.operating.now
         self._allow(min(self._commanded[0], round(now.base_bps / self._share)), now_ns)
-        return self.pacer.at_ceiling and self._base_of(self.pacer.rate_bps) >= _FAR_MORE * now.base_bps
 
     def least_decimation(self) -> int:
         """The least n at the link's rate, where each n-th source frame is coded: x265 needs some bits for each."""

@@ -227,8 +227,7 @@ class BaseStage:
             return None
         self._coding_began_ns = now_ns
         try:
-            finer = self.backlog is not None and self.backlog.offline and self.backlog.finer
-            if decision.reconfigures or (decision.keyframe and finer):
+            if decision.reconfigures:
                 self._at_keyframe(frame.index, now_ns=now_ns)
             regions = [] if self.regions is None else self.regions.regions(tracks)
             with self._turns:

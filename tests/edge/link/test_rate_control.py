@@ -77,32 +77,13 @@ def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps, soon_s, m
 
 
 @pytest.mark.parametrize(
-    ("budget", "way_s", "steps"),
-    [
-        (1_400_000, 0.3, [(0, 6e4)]),
-        (800_000, 0.3, [(0, 6e4), (20, 0), (40, 6e4)]),
-        (5_000_000, 0.02, [(0, 6e6), (20, 4e4)]),
-    ],
+    ("budget", "steps"), [(1_400_000, [(0, 6e4)]), (800_000, [(0, 6e4), (20, 0), (40, 6e4)])]
 )
-def test_a_queue_of_many_seconds_is_emptied_and_taken_for_no_longer_route(budget, way_s, steps):
+def test_a_queue_of_many_seconds_is_emptied_and_taken_for_no_longer_route(budget, steps):
     """Below the floor each picture would be half a minute old for the whole flight, and the next older still."""
-    flight = flown(80, *steps, size=(1280, 720), budget=budget, way_s=lambda _second: way_s)
+    flight = flown(80, *steps, size=(1280, 720), budget=budget, way_s=lambda _second: 0.3)
     assert max(flight.delays_between(65, 80)) < 4
     assert flight.longest_hole(65, 80) < 2
-
-
-@pytest.mark.parametrize(
-    ("steps", "stored_bps"), [([(0, 1e6), (0.3, 0)], 800_000), ([(0, 1.5e5), (9, 0)], 100_000)]
-)
-def test_a_link_that_goes_before_its_rate_is_found_limits_no_stored_picture(tmp_path, steps, stored_bps):
-    """An hour was stored at the quality of a flight's first second; where a link was thin, what it can carry is."""
-    flight = LiveFlight(
-        SteppedLink([*steps, (500, 1e6)]), size=(640, 360), budget=800_000, method="M0", store=tmp_path
-    )
-    flight.link_control.has_ground = lambda: flight.second < 12
-    flight.fly(15)
-    assert flight.backlog.offline
-    assert stored_bps <= flight.operating.now.base_bps <= 2 * stored_bps
 
 
 def test_a_fall_to_a_fifth_and_back():
@@ -476,8 +457,8 @@ def test_a_round_trip_and_a_rate_are_of_now_or_not_known():
 def test_a_link_that_comes_back_is_noticed_once():
     """No keyframe would come, and the ground would wait for one."""
     pacer = Pacer(controller())
-    assert not pacer.link(True, now_ns=S)
     honest(pacer, PrimaryReceiver(), now_ns=S, sequence=-1, seconds=5)
+    assert not pacer.link(True, now_ns=6 * S)
     assert not pacer.link(False, now_ns=6 * S)
     assert pacer.rate_bps == 100_000
     assert pacer.admits_base(6 * S)  # nothing leaves, and a recording goes on
