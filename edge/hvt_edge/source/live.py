@@ -259,8 +259,8 @@ class CameraClock:
         self._since_ns = self._begun_ns = 0
         """When the present least delay was begun, and when the first for the stamps as they count now."""
         self._proven = False
-        self._held_ns, self._fell_ns = 0, 0
-        """The least delay of a frame that was held back for long, and when it was found."""
+        self._late_ns = self._held_ns = self._fell_ns = 0
+        """How late the last frame was, the least of those that are held back for long, and when that was found."""
         self._recent: deque[int] = deque(maxlen=_RECENT)
         """Delays of the newest frames."""
 
@@ -291,12 +291,16 @@ class CameraClock:
         return 0 if 0 <= least_ns <= _MOST_DELAY_NS else least_ns
 
     def _counts_anew(self, camera_ns: int, late_ns: int, now_ns: int) -> bool:
-        # Frames that a network held back are late, but their stamps go on; where they go back, a clock was set.
+        # Frames that a network held back are late at once, and their stamps go on; where they go back, a clock was
+        # set, and where they fall behind step by step, they count another second.
+        leaps, self._late_ns = late_ns - self._late_ns > _MOST_SET_NS, late_ns
         if camera_ns < self._camera_ns:
             return late_ns > _MOST_SET_NS
         if late_ns <= _MOST_BEHIND_NS:
             self._held_ns = 0
             return late_ns < -_MOST_BEHIND_NS
-        if self._held_ns == 0 or late_ns < self._held_ns:
+        if self._held_ns == 0 and not leaps:
+            return True
+        if leaps or late_ns < self._held_ns - _NEAR_NS:
             self._held_ns, self._fell_ns = late_ns, now_ns
         return not self._proven or now_ns - self._fell_ns > _HELD_NS

@@ -99,10 +99,20 @@ def test_frames_that_a_network_held_back_are_as_old_as_they_are(fps, stall_s, ag
 def test_a_camera_whose_stamps_stood_still_is_not_old_for_ever():
     """Its encoder paused and goes on to number its frames: each later picture would be as old as the pause."""
     clock, zero = CameraClock(), 1_000_000 * SECOND_NS
-    for number in range(30 * 10):
-        now_ns = zero + number * SECOND_NS // 10 + (3 * SECOND_NS if number >= 150 else 0)
-        at_ns = clock.capture_ns(number * SECOND_NS // 10, now_ns=now_ns)
-    assert at_ns == now_ns
+    for number in range(30 * 10):  # its clock is fast, and its frames come unevenly
+        now_ns = zero + number * SECOND_NS // 10 + number % 3 * 5 * MS + (number >= 150) * 3 * SECOND_NS
+        at_ns = clock.capture_ns(number * 100_050_000, now_ns=now_ns)
+    assert now_ns - at_ns < SECOND_NS // 5
+
+
+@pytest.mark.parametrize("slower", [2, 5])
+def test_a_camera_that_goes_on_at_a_lower_rate_than_it_stamps_is_not_old(slower):
+    """An encoder that numbers frames, of a camera that takes fewer in the dark: pictures were called 10 s old."""
+    clock, now_ns, late_ns = CameraClock(), 1_000_000 * SECOND_NS, 0
+    for number in range(1000):
+        now_ns += SECOND_NS // 25 * (slower if number > 500 else 1)
+        late_ns = max(late_ns, now_ns - clock.capture_ns(number * SECOND_NS // 25, now_ns=now_ns))
+    assert late_ns < 2.2 * SECOND_NS
 
 
 def test_a_camera_that_says_its_time_late_stops_no_picture():
