@@ -45,6 +45,20 @@ def progress(sent_ns: int, arrived_bytes: float, *, delay_ns: int = 20 * MS, **c
     return Progress(now_ns=sent_ns + 40 * MS, sent_ns=sent_ns, arrived_ns=sent_ns + delay_ns, **said)
 
 
+class LosesOneWay(SteppedLink):
+    """For a second and a half nothing arrives, and reports go on."""
+
+    def carry(self, size_bytes: int, *, at_ns: int) -> int | None:
+        return None if 15 * S <= at_ns < 16.5 * S else super().carry(size_bytes, at_ns=at_ns)
+
+
+def test_live_video_is_back_after_a_loss_of_one_way_alone():
+    """What was lost would pass for a queue, and the picture stay dark for 10 s, until that had emptied."""
+    link = LosesOneWay(((0, 6_000_000),))
+    flight = LiveFlight(link, size=(1280, 720), budget=5_000_000, method="M0").fly(25)
+    assert flight.back_after(16.5) <= 1
+
+
 @pytest.mark.parametrize(
     ("found_s", "held", "more"),
     [
