@@ -15,6 +15,7 @@ import math
 import os
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -61,16 +62,20 @@ _OTHER_WORDS = re.compile(
     re.IGNORECASE,
 )
 """In the first bytes of files that hold labels of a kind that is not read; XML has bounding boxes of places."""
-_OTHER_TABLES = (".geojson", ".mat", ".npy", ".npz", ".parquet", ".tfrecord", ".tsv")
-_NUMBERS = re.compile(rb"(?im)^(?:\S+[,;\s]+)?(?:(?:[-+]?[\d.]+(?:e[-+]?\d+)?|nan)(?:[,;\s]+|$)){4}")
-"""Of a line with four numbers, be it behind a word."""
-_LOOKED_AT, _LOOKED_INTO = 65536, 1000
+_TABLES, _PACKED = (".csv", ".tsv", ".txt"), ".tfrecord"
+_NUMBER = rb"(?:[-+]?[\d.]{1,30}(?:e[-+]?\d{1,3})?|nan)"
+_BOX = re.compile(rb"(?im)^(?:%b[ \t,;]+){3}%b[ \t,;\r]*$" % (_NUMBER, _NUMBER))
+"""A line of four numbers and nothing else."""
+_WORDS, _IS_NUMBER = re.compile(rb"[\s,;:\"'/\\]+"), re.compile(_NUMBER, re.IGNORECASE)
+_POSES = re.compile(rb"^.*(?:gps|geo|pose)|\blat(?:itude)?(?:\b|_)|epsg", re.IGNORECASE)
+"""In the name or, below it, the head of a table of places."""
+_LOOKED_AT, _LIST, _LOOKED_INTO = 1 << 16, 1 << 20, 1000
 _CLASSES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml")
 _COCO = ("labels.json", "result.json", "annotations.json", "_annotations.coco.json", "coco.json")
 _COCO_BOXES = "instances_"
 """COCO's own name for the file with boxes, beside captions and keypoints of the same pictures; CVAT's too."""
-_NO_LABELS = ("captions_", "detections.csv")
-"""How names of COCO's texts begin, and the name of what ``hvt-study detect`` writes."""
+_NO_LABELS = ("captions_", "person_keypoints_", "detections.csv")
+"""How names of COCO's other files begin, and the name of what ``hvt-study detect`` writes."""
 _DEPTH = 3
 
 
@@ -144,32 +149,49 @@ def label_file(picture: Path, place: Path, folders: Folders) -> Path | None:
 
 
 def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) -> str:
-    """A sentence on the files of a set that look like labels and are not among those ``used``; empty for none.
+    """A sentence on the files of a set that look like labels of its pictures and are not among those ``used``.
 
-    Raises `UserError` where none was used and one of the others holds labels of a kind that is not read.
+    It is empty where there are none. Raises `UserError` where none was used and the place, or a folder of its
+    pictures, holds labels of a kind that is not read.
     """
     place, known = place.absolute(), {path.absolute() for path in used}
-    homes = dict.fromkeys(one.parent.absolute() for one in pictures)
+    pictures = [one.absolute() for one in pictures]
+    homes = Counter(one.parent for one in pictures)
+    near = dict.fromkeys((place, *homes))
     named = [
         (folder / name, f"labels of {kind}")
-        for folder in dict.fromkeys((place, *homes, *(home.parent for home in homes)))
+        for folder in dict.fromkeys((*near, *(home.parent for home in homes)))
         for name, kind in _OTHER.items()
         if "." in name
         or folder.is_relative_to(place)  # a folder beside the one that is given may have any name
     ]
     named += [(file.with_suffix(".json"), "labels of LabelMe") for file in pictures[:_DEPTH]]
     sure = {path: what for path, what in named if path.exists() and not _holds_camera_poses(path)}
-    folders = dict.fromkeys((*homes, *_folders(place, _DEPTH)))
+    folders = dict.fromkeys((*homes, *_open_folders(place, _DEPTH)))
     beside = [one for home in homes for one in home.parent.glob(f"{escape(home.name)}[._]*")]
     files = (one for folder in folders for one in sorted(folder.iterdir()))
+    names, sizes = {os.fsencode(one.name) for one in pictures}, {len(pictures), *homes.values()}
+    stems = set() if known else {one.stem for one in pictures}
+    kinds = {(path.parent, path.suffix) for path in known}
     unread = []
     for path in islice((one for one in (*files, *beside) if _may_hold_labels(one, known)), _LOOKED_INTO):
+        alike = path.stem in stems or (path.parent, path.suffix) in kinds
         with suppress(OSError), path.open("rb") as opened:
-            start = opened.read(_LOOKED_AT).replace(b"\0", b"")
-            if path.suffix.lower() in _OTHER_FILES and _OTHER_WORDS.search(start):
-                sure.setdefault(path, "labels, it seems")
-            elif path.suffix.lower() in _OTHER_TABLES or _NUMBERS.search(start):
+            listed, suffix = opened.read(_LIST).replace(b"\0", b""), path.suffix.lower()
+            start = listed[:_LOOKED_AT]
+            if suffix in _OTHER_FILES and _OTHER_WORDS.search(start):
+                if path.parent in (homes if known else near):
+                    sure.setdefault(path, "labels, it seems")
+                elif alike or not names.isdisjoint(_WORDS.split(start)):
+                    unread.append(path)
+            elif suffix == _PACKED:
                 unread.append(path)
+            elif suffix in _TABLES and not _POSES.search(
+                os.fsencode(f"{path.name}\n") + start.partition(b"\n")[0]
+            ):
+                rows = len(_BOX.findall(listed))
+                if (rows > 1 and rows in sizes) or _has_boxes(start, names, alike=alike):
+                    unread.append(path)
     if sure and not known:
         path, what = next(iter(sure.items()))
         raise UserError(f"{path} holds {what}, which are not read: export them as COCO, YOLO or Pascal VOC")
@@ -183,8 +205,17 @@ def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) ->
 
 
 def _may_hold_labels(path: Path, known: Container[Path]) -> bool:
-    named = path.suffix.lower() in (*_OTHER_FILES, *_OTHER_TABLES, ".txt")
-    return named and path not in known and not path.name.startswith(_NO_LABELS) and path.is_file()
+    named = path.suffix.lower() in (*_OTHER_FILES, *_TABLES, _PACKED) and not path.name.startswith(_NO_LABELS)
+    return named and path not in known and path.is_file()
+
+
+def _has_boxes(text: bytes, names: Container[bytes], *, alike: bool) -> bool:
+    # Four numbers behind the name of a picture; of a file called like one of labels a name is not asked for.
+    for words in map(_WORDS.split, text.splitlines()):
+        first = 0 if alike else next((at for at, word in enumerate(words, 1) if word in names), len(words))
+        if sum(bool(_IS_NUMBER.fullmatch(word)) for word in words[first:]) >= 4:
+            return True
+    return False
 
 
 def _holds_camera_poses(path: Path) -> bool:
@@ -218,7 +249,7 @@ def read_class_file(path: Path) -> tuple[str, ...]:
 
 def coco_files(place: Path) -> list[Path]:
     """COCO's files of a set: those of usual names, and of ``annotations/``."""
-    folders = _folders(place, 1)
+    folders = _open_folders(place, 1)
     found = [folder / name for folder in folders for name in _COCO if (folder / name).is_file()]
     files = sorted((place / "annotations").glob("[!.]*.json"))
     found += [one for one in files if one.name.startswith(_COCO_BOXES)] or files
@@ -272,13 +303,17 @@ def _words(value: object) -> list[str]:
 
 
 def _folders(root: Path, depth: int) -> list[Path]:
-    """A folder and those below it, so many levels; hidden ones are left out."""
-    inner = (
-        sorted(one for one in root.iterdir() if one.is_dir() and not one.name.startswith("."))
-        if depth
-        else []
-    )
+    """A folder and those below it, so many levels; hidden ones, and those that may not be seen, are left out."""
+    try:
+        inside = root.iterdir() if depth else ()
+        inner = sorted(one for one in inside if one.is_dir() and not one.name.startswith("."))
+    except OSError:
+        inner = []
     return [root, *(found for one in inner for found in _folders(one, depth - 1))]
+
+
+def _open_folders(root: Path, depth: int) -> list[Path]:
+    return [one for one in _folders(root, depth) if os.access(one, os.R_OK | os.X_OK)]
 
 
 def _candidates(picture: Path, place: Path) -> Iterator[Path]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -346,7 +347,6 @@ REFUSED = [
     ({"train.jsonl": '{"image": "a.jpg", "bbox": [1, 2, 3, 4]}'}, UNREAD),
     ({"vott.json": '{"regions": [{"boundingBox": {}}]}'}, UNREAD),
     ({"via.json": '{"a.jpg1": {"regions": [{"shape_attributes": {}}]}}'}, UNREAD),
-    ({"export/a.ndjson": '{"projects": {"annotations": {"objects": []}}}'}, UNREAD),
     ({"images/a.xml": "<kml/>"}, r"a\.xml is not an XML of Pascal VOC \(its root is kml"),
     # Of labels in pixels nothing is right; of classes from 1, each would be the next one, and the last left out.
     (
@@ -405,20 +405,61 @@ def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
     "files",
     [
         {"anno/bike1.txt": "NaN,NaN,NaN,NaN\n20,10,60,50\n"},  # UAV123
-        {"img/groundtruth_rect.2.txt": "20\t10\t60\t50\n"},  # OTB, of two targets
+        {"img/groundtruth_rect.2.txt": "20\t10\t60\t50\n" * 2},  # OTB, of two targets
+        {"export/a.ndjson": '{"external_id": "a.jpg", "projects": {"annotations": {"objects": []}}}'},
+        {"gt/a.txt": ROW},
         {"labels.csv": "image,a,b,c,d,label\na.jpg,20,10,80,60,bus\n"},
         {"train.txt": "img/a.jpg 20,10,80,60,1\n"},
         {"train.tfrecord": "\n"},
-        {"img/b.txt": ROW, "img/a.txt": ROW, "classes.txt": CLASSES},  # b has no picture
-        {"img/b.json": '{"shapes": []}', "img/a.txt": ROW, "classes.txt": CLASSES},
+        {"img/c.txt": ROW, "img/a.txt": ROW, "classes.txt": CLASSES},  # c has no picture
+        {"img/c.json": '{"shapes": []}', "img/a.txt": ROW, "classes.txt": CLASSES},
     ],
 )
 def test_files_that_are_not_understood_are_named(tmp_path, files):
     """Pictures were "not labelled", and nobody said that the file beside them was passed over."""
-    lay(tmp_path, "img/a.jpg", **files)
+    lay(tmp_path, "img/a.jpg", "img/b.jpg", **files)
     found = find_pictures(tmp_path, classes=None)
     first = next(iter(files))
     assert doubts_of(found)[0].startswith(f"1 files were not read as labels, the first: {tmp_path / first}; ")
+
+
+NUMBERS = "1.5,2,3,4,5\n" * 2
+NO_LABELS = {
+    "times.txt": "0.0\n0.1\n0.2\n0.3\n",
+    "calib.txt": "P0: 7.1e+02 0 6.0e+02 0\n",
+    "names.txt": "a" + "," * 60000,
+    "poses.csv": "time_s,latitude_deg,longitude_deg,height_m\n" + "0,47,8,30\n" * 2,
+    "gps.txt": "a.jpg 47 8 430 12\n",
+    "ImageSets/Main/train.txt": "a\n1\n2\n3\n4\n",
+    "runs/train/results.csv": NUMBERS,
+    "calib.npz": "x",
+    "rec/tracks.csv": "frame,x_min,y_min,x_max,y_max\n" + NUMBERS,
+    "odm/stats.json": '{"bbox": [1, 2, 3, 4]}',
+    "sparse/0/images.txt": "1 0.5 0.5 0.5 0.5 1 2 3 1 a.jpg\n",
+}
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        {},
+        {"images/a.txt": ROW, "images/classes.txt": "0\n1\n2\n3\n4\n", "package.json": '{"annotations": 1}'},
+        {"annotations/instances_a.json": coco(), "annotations/person_keypoints_a.json": coco()},
+    ],
+)
+def test_files_that_are_no_labels_are_not_named(tmp_path, monkeypatch, labels):
+    """Each set with a log beside it was said to have labels that nobody read; a folder of the disk's own ended it."""
+    lay(tmp_path, "images/a.jpg", "images/b.jpg", **NO_LABELS, **labels, **{"lost+found/a.txt": ROW})
+    listed = Path.iterdir
+
+    def iterdir(folder):
+        if folder.name == "lost+found":
+            raise PermissionError(13, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    monkeypatch.setattr("os.access", lambda folder, _: folder.name != "lost+found")
+    assert doubts_of(find_pictures(tmp_path, classes=None)) == []
 
 
 XML_OBJECT = voc()[voc().index("<object>") :]
