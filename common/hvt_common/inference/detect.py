@@ -47,8 +47,11 @@ _THERMAL_SHARE, _SECOND_SHARE = 0.65, 0.76
 """A small picture without colour is enlarged to this share of that side: larger, 640x512 shows people that are none.
 The second network of a file is silent there; a second run, at this share of the size, agrees instead (`averaged`).
 """
-_CONTRAST = 64
-"""Of a picture in which a network's scores differ from place to place."""
+_CONTRAST, _ALIKE = 64, 20
+"""Of a picture in which a network's scores differ from place to place, as they do in one of so many.
+
+Scores in steps of 1/127 are all 0 in many a picture without objects.
+"""
 _BROKEN = 0.1
 """Where no more of an answer is no number, that is some cells; the scores of one class are a fifth."""
 _TWIN_IOU = 0.8
@@ -221,7 +224,7 @@ class OnnxDetector:
         )
         self._group_ids = _group_ids(self.class_names)
         self._are_names, self._beyond_said = names is not None, False
-        self._scores_looked_at = not self.head.suppresses
+        self._alike_left = _ALIKE if self.head.suppresses else 0
         self._letterboxer = Letterboxer(
             anchor=self.head.anchor,
             preparation=self.preparation,
@@ -295,14 +298,16 @@ class OnnxDetector:
             found = self.head.decode(outputs, confidence=least, input_size=input_size)
         except UserError as error:
             raise UserError(f"model {self.model.path} {error}") from None
-        if not self._scores_looked_at and int(image.max()) - int(image.min()) > _CONTRAST:
-            self._scores_looked_at = True
+        if self._alike_left and int(image.max()) - int(image.min()) > _CONTRAST:
             scores = self.head.decode(outputs, confidence=0.0, input_size=input_size).scores
-            if not len(scores) or scores.min() == scores.max():
+            alike = not len(scores) or scores.min() == scores.max()
+            self._alike_left = self._alike_left - 1 if alike else 0
+            if alike and not self._alike_left:
                 _log.warning(
-                    "%s gives all places of a picture the score %.3g, and can tell no object: if it was made smaller"
-                    " (INT8), boxes and scores need a scale each, else a detector of floating point is accepted",
+                    "%s gave all places of each of %d pictures one score (%.3g), and told no object: if it was"
+                    " made smaller (INT8), boxes and scores need a scale each; one of floating point is accepted",
                     self.model.path.name,
+                    _ALIKE,
                     max(scores, default=0.0),
                 )
         used = [outputs[index] for index in self.head.outputs]
