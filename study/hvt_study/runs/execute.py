@@ -295,13 +295,19 @@ class _Flights:
 
     def _made(self, make: Callable[[RunContext], RunRow]) -> RunRow:
         try:
-            return make(open_run_context(self._here, cache=self._folder))
-        except (UserError, _RefusedError, MemoryError):
+            return make(self._context())
+        except (UserError, _RefusedError, _BrokenError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - one bad flight of thousands must not end them all
             _log.exception("%s on %s ended in an error", self._spec.method, self._spec.sequence)
             said = str(error).strip().partition("\n")[0]
             raise _BrokenError(f"{type(error).__name__}: {said}".rstrip(": ")) from None
+
+    def _context(self) -> RunContext:
+        context = open_run_context(self._here, cache=self._folder)
+        if context.content != self._found.content:  # the flight would be kept under the name of the old ones
+            raise _BrokenError("files of the dataset or of a network were written meanwhile: run it again")
+        return context
 
     def _key(self, what: str, budget_bps: int, shape: VideoShape, *more: Any) -> str:
         spec, found = self._spec, self._found

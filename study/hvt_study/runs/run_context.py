@@ -184,14 +184,15 @@ def _first_stamp(path: Path) -> tuple[int, int]:
 def _forget_if_changed(spec: RunSpec) -> None:
     # Else a result of old weights, still open, would be kept under the name of new ones, or the reverse.
     sequence, _ = _sequence(spec.dataset, spec.sequence)
-    models = (path for paths in _model_files(spec.models).values() for path in paths)
-    for path in (*models, *sequence.files):
-        if file_stamp(path) != _first_stamp(path):
-            _log.warning(
-                "%s was written while the study runs: runs from here on are of what it holds now", path
-            )
-            _forget()
-            return
+    paths = (*(path for paths in _model_files(spec.models).values() for path in paths), *sequence.files)
+    changed = next((path for path in paths if file_stamp(path) != _first_stamp(path)), None)
+    if changed is not None:
+        _log.warning(
+            "%s was written while the study runs: runs from here on are of what it holds now", changed
+        )
+        _forget()
+        for path in paths:  # at once, so that a later write is noticed too
+            _first_stamp(path)
 
 
 _OPEN_FILES = Path("/proc/self/fd")

@@ -227,17 +227,33 @@ def test_files_that_change_in_a_study_or_after_it_are_read_anew(tmp_path, monkey
     monkeypatch.setattr(execute, "flown", lambda *_, **__: {}["none"])
     found = []
     labels, weights = tmp_path / "scene" / "annotations" / "street.txt", Path(detector(uri))
-    changes = [(labels, b""), (labels, b"1,99,0,0,9,9,1,4,0,0\n"), (weights, b"\x72\x07\x0a\x01a\x12\x02bc")]
-    for path, more in changes:
+    more = b"\x72\x07\x0a\x01a\x12\x02bc"
+    changes = [(labels, b""), (labels, b"1,99,0,0,9,9,1,4,0,0\n"), (weights, more)]
+
+    def write(path, more):
+        path.write_bytes(path.read_bytes() + more)
+
+    for path, added in changes:
         row = execute.run_spec(spec, cache=tmp_path / "cache", study="one")
         found.append(json.loads(row["content"]))
-        path.write_bytes(path.read_bytes() + more)
+        write(path, added)
     found.append(json.loads(execute.run_spec(spec, cache=tmp_path / "cache", study="one")["content"]))
     assert found[0] == found[1]
     assert found[2]["clip"] != found[1]["clip"]
     assert found[3]["clip"] == found[2]["clip"]
     assert found[3]["detector"] != found[2]["detector"] == found[0]["detector"]
     assert f"{weights} was written while the study runs" in caplog.text
+    clips = []
+    for _ in range(3):  # of cached flights, which open no pictures
+        clips.append(open_materials(spec, cache=tmp_path / "cache").content["clip"])
+        write(labels, b"2,99,0,0,9,9,1,4,0,0\n")
+    assert len({*clips}) == 3
+    with monkeypatch.context() as late:
+        late.setattr(
+            execute, "open_run_context", lambda *a, **k: write(weights, more) or open_run_context(*a, **k)
+        )
+        row = execute.run_spec(spec, cache=tmp_path / "cache", study="one")
+    assert "were written meanwhile" in row["failed"]
     open_before = open_materials(spec, cache=tmp_path / "cache").detector
     execute.run_spec(spec, cache=tmp_path / "cache", study="two")
     assert open_materials(spec, cache=tmp_path / "cache").detector is not open_before
