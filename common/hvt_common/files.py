@@ -103,7 +103,7 @@ def write_whole(path: Path, content: bytes) -> None:
     A pipe, a device or standard output takes the bytes as they come, after everything printed before.
     Raises `OSError`.
     """
-    if _is_output(path):
+    if is_output(path):
         sys.stdout.flush()
         with open(1, "wb", closefd=False) as output:
             output.write(content)
@@ -154,7 +154,8 @@ def _warn_of(folder: Path, why: str) -> None:
     _log.warning("%s takes no locks (%s): let one program at a time write there", folder, why)
 
 
-def _is_output(path: Path) -> bool:
+def is_output(path: Path) -> bool:
+    """Whether it leads to where standard output goes."""
     try:
         return os.path.samestat(path.stat(), os.fstat(1))
     except OSError:  # not there yet

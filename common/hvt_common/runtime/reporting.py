@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read, telling
-from hvt_common.files import claim_name, write_whole
+from hvt_common.files import claim_name, is_output, takes_lock, write_whole
 from hvt_common.runtime.log import STATUS_LOGGER
 from hvt_common.units import shown_text
 
@@ -170,20 +170,44 @@ def write_json(
     ``before`` is `version_of` the file as the run began: a file that another run has written since is kept, and this
     one gets the next free name.
     """
+    text = (json.dumps(content, indent=2) + "\n").encode()
     try:
-        if before is not None and version_of(path) not in (before, ()):
-            names = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in itertools.count(2))
-            other, path = path, next(one for one in names if claim_name(one))
-            _log.warning("another run has written %s meanwhile: this summary is in %s", other, path)
-        write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
+        with _first_of(path, before) as is_first:
+            if is_first:
+                write_whole(path, text)
+                return
+        names = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in itertools.count(2))
+        other, path = path, next(one for one in names if claim_name(one))
+        _log.warning("another run has written %s meanwhile: this summary is in %s", other, path)
+        write_whole(path, text)
     except OSError as error:
         raise FlightError(f"{path} cannot be written ({error.strerror})") from error
 
 
-def version_of(path: Path | None) -> tuple[int, ...]:
-    """Another value once a regular file was written anew; empty where there is none."""
+@contextlib.contextmanager
+def _first_of(path: Path, before: object) -> Iterator[bool]:
+    # Whether no other run has written the file since, or is about to; nobody waits for a lock here.
+    if before is None or is_output(path) or (path.exists() and not path.is_file()):
+        yield True
+        return
+    real = Path(os.path.realpath(path))
+    lock = real.with_name(f"{real.name}.lock")
+    file = os.open(lock, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    is_ours = takes_lock(file) and bool(
+        os.fstat(file).st_nlink
+    )  # its last holder may have removed it just now
     try:
-        found = None if path is None else path.stat()
+        yield is_ours and version_of(path) in (before, ())
+    finally:
+        if is_ours:
+            lock.unlink(missing_ok=True)
+        os.close(file)
+
+
+def version_of(path: Path | None) -> tuple[int, ...]:
+    """Another value once a regular file was written anew; empty where there is none, and for standard output."""
+    try:
+        found = None if path is None or is_output(path) else path.stat()
     except OSError:
         found = None
     if found is None or not stat.S_ISREG(found.st_mode):

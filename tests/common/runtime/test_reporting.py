@@ -12,6 +12,8 @@ import pytest
 
 from hvt_common import files
 from hvt_common.errors import FlightError, UserError, exit_with_sentence
+from hvt_common.files import write_whole
+from hvt_common.runtime import reporting
 from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, version_of, write_json
 
 
@@ -43,7 +45,7 @@ def test_a_summary_goes_into_a_pipe_and_through_a_link(tmp_path):
         assert json.loads(file.read_text()) == {"frames": frames}
 
 
-def test_of_two_runs_at_once_none_loses_its_summary(tmp_path, caplog):
+def test_of_two_runs_at_once_none_loses_its_summary(tmp_path, caplog, monkeypatch):
     """The second ground of a script would replace the first one's; a script that runs again replaces the old one."""
     path, second = tmp_path / "summary.json", tmp_path / "summary-2.json"
     for number in (1, 2):
@@ -53,6 +55,17 @@ def test_of_two_runs_at_once_none_loses_its_summary(tmp_path, caplog):
     write_json(path, {"run": 3}, before=before)
     assert [json.loads(one.read_text())["run"] for one in (path, second)] == [2, 3]
     assert caplog.messages == [f"another run has written {path} meanwhile: this summary is in {second}"]
+    before = version_of(path)
+
+    def written(file, content):
+        monkeypatch.undo()
+        write_json(path, {"run": 5}, before=before)  # ends while the other one is about to write
+        write_whole(file, content)
+
+    monkeypatch.setattr(reporting, "write_whole", written)
+    write_json(path, {"run": 4}, before=before)
+    runs = {one.name: json.loads(one.read_text())["run"] for one in tmp_path.iterdir()}
+    assert runs == {"summary.json": 4, "summary-2.json": 3, "summary-3.json": 5}
 
 
 def test_a_summary_on_standard_output_stands_behind_what_was_printed(tmp_path):
@@ -60,8 +73,9 @@ def test_a_summary_on_standard_output_stands_behind_what_was_printed(tmp_path):
     link = tmp_path / "stdout"
     link.symlink_to("/dev/fd/1")
     program = (
-        "import sys; from pathlib import Path; from hvt_common.runtime.reporting import write_json;"
-        "print('table'); write_json(Path(sys.argv[1]), {}); print('end')"
+        "import sys; from pathlib import Path; from hvt_common.runtime.reporting import version_of, write_json;"
+        "path = Path(sys.argv[1]); before = version_of(path);"
+        "print('table', flush=True); write_json(path, {}, before=before); print('end')"
     )
     with (tmp_path / "run.txt").open("w") as output:
         subprocess.run([sys.executable, "-c", program, str(link)], stdout=output, check=True)
