@@ -25,7 +25,6 @@ from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
 _Config = TypeVar("_Config")
-_MOST_BYTES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,7 +327,7 @@ def _one(given: Any, *, name: str) -> str:
 def _from_file(config_class: type, file: Path) -> dict[str, Any]:
     fields = {field.name.replace("_", "-"): field for field in dataclasses.fields(config_class)}
     try:
-        table = toml_table(read_text(file, most=_MOST_BYTES))
+        table = toml_table(read_text(file))
     except FileNotFoundError:
         raise absent(file)(f"--config {file} does not exist: give a TOML file") from None
     except OSError as error:

@@ -8,6 +8,7 @@ import errno
 import fcntl
 import logging
 import os
+import re
 import select
 import stat
 import sys
@@ -24,8 +25,15 @@ MOST_TABLE_BYTES = 1_000_000_000
 """Limit for labels and annotations of a whole dataset."""
 PIPE_WAIT_S = 10.0
 """The longest wait for a pipe's other end, and then for its content."""
-_MOST_DOTS = 300
-"""In a line of TOML: the time that Python takes for a key grows with the square of its parts, to many minutes."""
+_MOST_TOML, _MOST_PARTS = 1_000_000, 32
+"""Characters of TOML, and parts of a key: the time that Python takes grows with their square, to many minutes."""
+_NO_KEY = re.compile(
+    r'"""(?:[^\\]|\\.)*?(?:"{3,5}|\Z)|' + r"'''.*?(?:'{3,5}|\Z)"
+    r'|"(?:[^"\\\n]|\\[^\n])*+"?' + r"|'[^'\n]*+'?|#[^\n]*+",
+    re.DOTALL,
+)
+"""Strings, closed or not, and comments."""
+_LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{_MOST_PARTS}}}")
 _LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
 _log = logging.getLogger(__name__)
 
@@ -90,10 +98,11 @@ def decoded(content: bytes) -> str:
 
 
 def toml_table(text: str) -> dict[str, Any]:
-    """TOML as a table. Raises `ValueError`, also for a line of too many dots, and `RecursionError`."""
-    for number, line in enumerate(text.split("\n"), start=1):
-        if line.count(".") > _MOST_DOTS:
-            raise ValueError(f"line {number} has more than {_MOST_DOTS} dots: no key has so many parts")
+    """TOML as a table. Raises `ValueError`, also for a text or a key that is too long, and `RecursionError`."""
+    if len(text) > _MOST_TOML:
+        raise ValueError(f"it has {len(text)} characters, accepted are at most {_MOST_TOML}")
+    if (key := _LONG_KEY.search(_NO_KEY.sub("_", text))) is not None:
+        raise ValueError(f"the key {key[0][:20]}… has more than {_MOST_PARTS} parts")
     return tomllib.loads(text)
 
 

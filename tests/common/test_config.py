@@ -68,8 +68,11 @@ def test_flags_go_over_the_file_and_the_file_over_defaults(tmp_path):
 
 def test_a_file_may_hold_plain_numbers_and_either_spelling(tmp_path):
     """TOML has numbers of its own; to have to quote them would be a surprise."""
+    dots = "a." * 400
     config = read_file(
-        tmp_path, 'budget = 300000\nwait = 2\ngain = 0.25\nfit_mode = "letterbox"\nlisten = "tcp/a:1"\n'
+        tmp_path,
+        f"# {dots}\nsource = '{dots}' # {dots}\n"
+        'budget = 300000\nwait = 2\ngain = 0.25\nfit_mode = "letterbox"\nlisten = "tcp/a:1"\n',
     )
     assert (config.budget, config.wait, config.gain) == (300_000, 2.0, 0.25)
     assert (config.fit_mode, config.listen) == ("letterbox", ("tcp/a:1",))
@@ -113,7 +116,13 @@ def test_what_was_set_is_told_apart_from_what_was_not(tmp_path):
         ("budget = ", "is not valid TOML"),
         ("a = 1\na = 2", "is not valid TOML"),
         pytest.param(f"a = {'[' * 9999}", "is not valid TOML", id="deep"),
-        pytest.param("a." * 99_999 + "b = 1", "line 1 has more than 300 dots", id="a key of many parts"),
+        pytest.param("a = {" + "'b' ." * 99_999 + "b = 1}", "the key _ ._", id="a key of quoted parts"),
+        pytest.param("a=1\n" * 300_000, "it has 1200000 characters, accepted", id="large"),
+        pytest.param(
+            "a." * 99_999 + "b = 1",
+            "the key a.a.a.a.a.a.a.a.a.a.… has more than 32 parts",
+            id="a key of many parts",
+        ),
     ],
 )
 def test_a_wrong_file_is_one_sentence(tmp_path, text, said):
