@@ -70,8 +70,8 @@ _UNKNOWN_YAW = (655.35, 65535.0)
 _UNSAID = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 """How programs write that they have no value, in small letters."""
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+\s*", re.ASCII)
-_NO_TIME_OF_DAY = re.compile(r"\s*(?:[\d.]+|[\d-]{10})\s*", re.ASCII)
-"""Python takes a day alone for its midnight, and some milliseconds since 1970 for a day of old."""
+_NO_TIME_OF_DAY = re.compile(r"\s*(?:[\d.]+|[\dw-]{7,10})\s*", re.ASCII | re.IGNORECASE)
+"""Python takes a day alone (2026-W48-1) for its midnight, and some milliseconds since 1970 for a day of old."""
 _Values = Mapping[str, float]
 
 
@@ -248,6 +248,7 @@ def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     lines = csv.DictReader(written, delimiter=between, skipinitialspace=between != "\t")
     names = [(name or "").strip().lower() for name in lines.fieldnames or ()]
     lines.fieldnames = names
+    last = (names or [""])[-1]
     names = [name for name in names if name]  # row numbers and what follows a last comma have none
     if twice := [name for name in names if names.count(name) > 1]:
         raise UserError(f"pose file {path} has the column {twice[0]!r} twice")
@@ -260,7 +261,10 @@ def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
         raise UserError(f"pose file {path} lacks the column {missing[0]}")
     for number, line in enumerate(lines, 1):
         where = f"pose file {path}, row {number}"
-        if any(cell.strip() for cell in line.get(None, ())):  # csv keeps the rest there
+        surplus = line.get(
+            None, ()
+        )  # csv keeps the rest there: a comma at the end, or a word, moves no value
+        if surplus and (len(surplus) > 1 or not line[last].strip() or surplus[0].strip(" +-")[:1].isdigit()):
             yield UserError(
                 f"{where} has more values than there are columns: is a decimal comma one of them?"
             )

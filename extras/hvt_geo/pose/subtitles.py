@@ -12,10 +12,10 @@ _NUMBER = r"[+-]?\d++(?:[.,]\d++)?+(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d)"
 """With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06'01"."""
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
-_LETTER = r"(?:\s?°?\s?([EWNS])\b)?"
+_LETTER = r"(?:\s?°?\s?([EWNS])\b(?!\s*:))?"
 _NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}{_LETTER}")
 _HEMISPHERES = re.compile(rf"([EWNS])\s*:\s*({_NUMBER})|({_NUMBER}){_LETTER[:-1]}")
-"""Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter behind the number."""
+"""Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter behind the number, of one of both at least."""
 _GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
 _HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})(?:\s*m\b|{_FEET[3:-2]})")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
@@ -37,6 +37,7 @@ _DJI = {
 """Names in the subtitles; ``longtitude`` is how some models spell it."""
 _IN_PARTS = {"focal_len": (200, 10), "dzoom_ratio": (200, 10_000)}
 """A whole number beyond the first value counts parts, the second many to one: 240 is 24 mm, 480.00 is 480 mm."""
+_NEGATIVE = {"latitude_deg": "S", "longitude_deg": "W"}
 _MOST_LATITUDE = 90.0
 _MOST_SATELLITES = 60
 
@@ -83,8 +84,8 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
             least, parts = _IN_PARTS.get(name.lower(), (0, 1))
             value = _value(said, feet=feet)
             value = value / parts if said.isdecimal() and value > least else value
-            southern = letter in ("W", "S") and name.lower() in ("latitude", "longitude", "longtitude")
-            row[_DJI[name.lower()]] = -abs(value) if southern else value
+            column = _DJI[name.lower()]
+            row[column] = -abs(value) if letter == _NEGATIVE.get(column) else value
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
         row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
@@ -95,13 +96,17 @@ def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
     found = _GPS.search(body)
     if found is None:
         return {}
+    place = _numbers(found[1])
     if letters := _HEMISPHERES.findall(found[1]):
         values = [(before or behind, _value(one or two)) for before, one, two, behind in letters]
-        return {
+        said = {
             "longitude_deg" if letter in "EW" else "latitude_deg": -abs(value) if letter in "WS" else value
             for letter, value in values  # some write the sign as well
         }
-    place = _numbers(found[1])
+        if len(said) == 1 and len(place) >= 2:  # of the first two numbers the other one is the other
+            other = place[values[0][0] in place[0][1]][0]
+            said = dict.fromkeys(_NEGATIVE, other) | said
+        return said
     if len(place) < 2:
         return {}
     names = ("latitude_deg", "longitude_deg") if latitude_first else ("longitude_deg", "latitude_deg")

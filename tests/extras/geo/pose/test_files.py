@@ -171,8 +171,11 @@ FIRST = MINI.split("2\n00:", maxsplit=1)[0]
         ("a.csv", f"{PLACE}\n0,1,2\n0,1,2\n", "do not rise"),
         ("a.csv", f"{PLACE}\n0,95,2\n", "latitude_deg is 95"),
         ("a.csv", f"{PLACE}\n0,0,47,5,9,7\n", "row 1 has more values than there are columns"),
+        ("a.csv", f"{PLACE},height_m,yaw_deg\n0,47,5,9,7,,\n", "row 1 has more values"),
+        ("a.csv", f"{PLACE},height_m,yaw_deg\n0,47,5,9,,\n", "row 1 has more values"),
         ("a.csv", "utc,latitude_deg,longitude_deg\n1701010112345,1,2\n", "'1701010112345' is not ISO 8601"),
         ("a.csv", "utc,latitude_deg,longitude_deg\n2026-11-23,1,2\n", "'2026-11-23' is not ISO 8601"),
+        ("a.csv", "utc,latitude_deg,longitude_deg\n2026-W48-1,1,2\n", "'2026-W48-1' is not ISO 8601"),
         (
             "a.csv",
             f"{PLACE}\n0,116.2,40.1\n1,116.2,40.1\n",
@@ -258,6 +261,8 @@ def test_a_fixed_camera_is_where_it_was_put():
             (51.4779, -1.5e-5, 50.5),
             "",
         ),
+        ("latitude: 47.1 longitude: 8.5 S: 12", (47.1, 8.5, None), ""),
+        ("[latitude: 47.1 W] [longitude: 8.5 W: 12] [longitude: 8.5 S]", (47.1, 8.5, None), ""),
         ("[latitude: 48,1000] [longitude: 11,5000] [rel_alt: 50,5 abs_alt: 570,2]", (48.1, 11.5, 50.5), ""),
         (
             "[latitude : -34.5] [longtitude : -58.5] [altitude: 74.7]",
@@ -313,6 +318,7 @@ def test_a_track_is_read_as_a_phone_writes_it(tmp_path, caplog, seconds, says):
         ",time_s,latitude_deg,longitude_deg,height_m,\n0,0,47.5,9.7,50.5,\n1,1,47.5,9.7,50.5,\n",
         f"{PLACE},height_m,hfov_deg\n0,47.5,9.7,50.5,NaN\n1,47.5,9.7,50.5,N/A\n2,nan,null,-,None\n3,,,,\n",
         f"{PLACE},height_m,camera_yaw_deg,camera_pitch_deg\n0,47.5,9.7,50.5,0,-90.3\n",
+        f"{PLACE},height_m\n0,47.5,9.7,50.5,GPS\n1,47.5,9.7,50.5,\n",
         f"utc,{PLACE},height_m\n2026-01-01T10:00:00Z,,49,9.7,8\n2026-01-01T10:00:01Z,0,47.5,9.7,50.5\n",
     ],
 )
@@ -343,6 +349,8 @@ def test_subtitles_are_told_apart_by_their_times(tmp_path, change):
         "GPS(W: 70.5, S: 33.25, 30.5m)",
         "GPS(W: -70.5, S: 33.25, 30.5m)",
         "GPS(33.25S, 70.5°W, 30)",
+        "GPS(33.25S, -70.5, 30)",
+        "GPS(-70.5, 33.25 S, 30)",
         "[latitude: 33.25 S] [longitude: 70.5° W]",
     ],
 )
