@@ -180,7 +180,7 @@ def state_message(state: GroundState) -> str:
     """The state of all edges, for the wall and the plot; the words that an operator reads are made here."""
     edges = {one.edge: _edge(one, state) for one in state.edges}
     elsewhere = {edge: {"member": one.member, "page": one.page} for edge, one in state.elsewhere.items()}
-    failed = [_failure(part.part, part, state.at_ns) for part in state.failed]
+    failed = [*state.behind, *(_failure(part.part, part, state.at_ns) for part in state.failed)]
     return text("state", at=state.at_ns // _MILLION, edges=edges, elsewhere=elsewhere, failed=failed)
 
 
@@ -190,7 +190,7 @@ def _edge(one: EdgeState, state: GroundState) -> dict[str, Any]:
     if session is None:
         return said | _NO_SESSION
     at_edge = [(part, _failure(part_words(part.part), part, state.at_ns)) for part in session.edge_failed]
-    failed += [*session.behind, *(f"at the edge: {words}" for _, words in at_edge)]
+    failed += [f"at the edge: {words}" for _, words in at_edge]
     short = [words for part, words in at_edge if part.part == "source"]
     if session.total_bps is not None:
         thin = "link or machine too slow, " if one.link == "thin" else ""

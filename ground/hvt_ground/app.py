@@ -85,6 +85,7 @@ class _Parts:
     factory: SessionFactory
     services: Sequence[Service]
     watchers: Sequence[_Watcher]
+    outputs: Outputs
     line: StatusLine
 
 
@@ -187,7 +188,7 @@ class Ground:
                 program=self._program,
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
-            parts = _Parts(models, factory, services, watchers, line)
+            parts = _Parts(models, factory, services, watchers, outputs, line)
             try:
                 while self._serve_link(session, parts):
                     links.close()
@@ -316,6 +317,7 @@ class Ground:
             classifier=Path(config.classifier or "none").name,
             calibrated=models.facts.stills_calibrated,
             failures=models.failures,
+            outputs=parts.outputs,
             loading=lambda: models.loading,
             recorded=parts.factory.records,
             group=group,

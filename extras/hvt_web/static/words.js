@@ -94,7 +94,7 @@ export function standing(facts) {
  * To who listens, when it changes: without the times, which are others each moment.
  * @param {string} said of the picture @param {string[]} failed
  */
-export const spokenWords = (said, failed) => [said, ...failed].join(". ").replace(/,?( picture| for)? \d[\d.]* (s|min|h)( old)?(?=\.|$)/g, "");
+export const spokenWords = (said, failed) => [said, ...failed].join(". ").replace(/,?( picture| for| by)? \d[\d.]* (s|min|h)( old)?(?=\.|$)/g, "");
 
 /**
  * In the middle of an empty picture, by the state.

@@ -20,6 +20,7 @@ from hvt_ground.events import Traffic
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import Elsewhere, Group
+from hvt_ground.sinks import Outputs
 
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 """``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out that the link does not
@@ -174,8 +175,6 @@ class SessionState:
     backlog_video_s: float = _of(lambda at: at.session.backlog.totals.video_s)
     backlog_working: int = _of(lambda at: at.backlog.working)
     """Objects of the backlog that have come and are not where they belong yet."""
-    behind_s: Mapping[str, float] = _of(lambda at: at.session.behind_s)
-    """By recording or other output that is late: the age of its oldest event that is not written."""
     edge_frames: FrameAccount | None = _counted(  # noqa: RUF009 - likewise
         lambda status: status.frame_account if status.frames else None
     )
@@ -188,10 +187,6 @@ class SessionState:
     edge_detect_ms: float | None = _edge(lambda health: health.detect_ms or None)
     edge_still_queue: int | None = _edge(lambda health: health.still_queue)
     edge_failed: tuple[FailedPart, ...] = _of(_failed_at_edge)
-
-    @property
-    def behind(self) -> list[str]:
-        return [f"{part} is behind by {late_s:.0f} s" for part, late_s in self.behind_s.items()]
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +231,12 @@ class GroundState:
     """By edge, the other member of the group that serves it."""
     failed: tuple[FailedPart, ...]
     """Models, recordings and other sinks."""
+    behind_s: Mapping[str, float]
+    """By recording or other output that is late: the age of its oldest event that is not written."""
+
+    @property
+    def behind(self) -> list[str]:
+        return [f"{part} is behind by {late_s:.0f} s" for part, late_s in self.behind_s.items()]
 
     def as_dict(self) -> dict[str, Any]:
         found = asdict(self)
@@ -255,6 +256,7 @@ class StateMaker:
     classifier: str = ""
     calibrated: bool = False
     failures: Failures | None = None
+    outputs: Outputs | None = None
     loading: Callable[[], bool] = lambda: False
     recorded: bool = True
     group: Group | None = None
@@ -284,6 +286,7 @@ class StateMaker:
             member=None if self.group is None else self.group.member,
             elsewhere={} if self.group is None else self.group.elsewhere,
             failed=() if self.failures is None else self.failures.now,
+            behind_s={} if self.outputs is None else self.outputs.behind_s,
         )
 
     def _edge(self, edge: str, sessions: EdgeSessions, now_ns: int) -> EdgeState:

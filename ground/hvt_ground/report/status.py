@@ -27,7 +27,7 @@ def status_text(state: GroundState) -> str:
     edges += map(_edge_text, ended) if len(ended) <= _MOST_ENDED else [f"{len(ended)} edges ended"]
     elsewhere = [f"{edge}: at {one.member}" for edge, one in state.elsewhere.items()]
     loading = ["detector loading"] * state.loading
-    return " | ".join([*edges, *elsewhere, *loading, *map(failed_text, state.failed)])
+    return " | ".join([*edges, *elsewhere, *loading, *state.behind, *map(failed_text, state.failed)])
 
 
 def _edge_text(one: EdgeState) -> str:
@@ -52,8 +52,7 @@ def _edge_text(one: EdgeState) -> str:
             f"tracks {session.tracks}, {session.tracks_refined} refined{age}"
             f"{'  UNKNOWN VIEW' if session.view_unlike else ''}"
         )
-    behind = [] if session is None else session.behind
-    return "  ".join([said, *behind, *map(failed_text, one.failed)])
+    return "  ".join([said, *map(failed_text, one.failed)])
 
 
 def summary(session: Session) -> dict[str, Any]:

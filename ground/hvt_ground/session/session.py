@@ -35,7 +35,7 @@ from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.poses import NOWHERE, Locator, SessionPoses
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.sinks import BEHIND_S, QueuedSink, Sink
+from hvt_ground.sinks import QueuedSink, Sink
 
 _MILLION = 1_000_000
 _LINES_AT_ONCE = 60
@@ -223,11 +223,6 @@ class Session:
         self.note("info", "the flight has ended" if ended else "this session has ended", last=True)
 
     # Its state
-
-    @property
-    def behind_s(self) -> dict[str, float]:
-        """Seconds, by part: the age of the oldest event that a sink has not written, where it is long."""
-        return {one.part: late_s for one in self._queued if (late_s := one.behind_s) >= BEHIND_S}
 
     @property
     def pipeline(self) -> Pipeline:

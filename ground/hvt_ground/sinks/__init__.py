@@ -6,6 +6,6 @@ Here are `palette` (colours) and the room `rerun`.
 
 from __future__ import annotations
 
-from hvt_ground.sinks.queued import BEHIND_S, Outputs, QueuedSink, Receipt, Sink, SinkWriter
+from hvt_ground.sinks.queued import Outputs, QueuedSink, Receipt, Sink, SinkWriter
 
-__all__ = ["BEHIND_S", "Outputs", "QueuedSink", "Receipt", "Sink", "SinkWriter"]
+__all__ = ["Outputs", "QueuedSink", "Receipt", "Sink", "SinkWriter"]

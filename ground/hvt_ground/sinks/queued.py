@@ -376,6 +376,13 @@ class Outputs:
         with self._lock:
             return all(one.idle for one in self._sinks)
 
+    @property
+    def behind_s(self) -> dict[str, float]:
+        """Seconds, by part: the age of the oldest item that a sink has not written, where it is long."""
+        with self._lock:
+            late = sorted((one.behind_s, one.part) for one in self._sinks)  # of one part the latest counts
+        return {part: late_s for late_s, part in late if late_s >= BEHIND_S}
+
     def close(self, *, within_s: float = 8.0) -> None:
         """End them all, within that time."""
         with self._lock:

@@ -44,7 +44,7 @@ class Ground:
         self.failures = Failures(clock)
         self.clock = clock
         self.maker = StateMaker(clock, failures=self.failures)
-        self.outputs = Outputs(self.failures)
+        self.outputs = self.maker.outputs = Outputs(self.failures)
         self.opened: list[Session] = []
         self.ended: list[Session] = []
         self.sessions = EdgeSessions(self.port, open_session=self.open_one, on_ended=self.ended.append)
@@ -154,9 +154,11 @@ def test_a_recording_that_is_behind_is_told_on_line_and_page(ground, monkeypatch
     """The log alone told that a kill would lose half a minute of it."""
     monkeypatch.setattr(QueuedSink, "behind_s", 37.4)
     state = ground.state()
-    assert "  recording of uav-1 is behind by 37 s  " in status_text(state)
-    shown = json.loads(state_message(state))["edges"]["uav-1"]["failed"]
-    assert "recording of uav-1 is behind by 37 s" in shown
+    told = ["recording of uav-1 is behind by 37 s", "recording of uav-10 is behind by 37 s"]
+    assert f" | {' | '.join(told)} | " in status_text(state)
+    assert json.loads(state_message(state))["failed"][:2] == told
+    ground.sessions.close()
+    assert told[1] in ground.line(), "the session has ended, its output not"
     monkeypatch.setattr(QueuedSink, "behind_s", 1.0)
     assert "behind" not in ground.line()
 
