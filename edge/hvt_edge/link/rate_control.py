@@ -413,7 +413,9 @@ class RateController:
         span_ns = last.arrived_ns - first.arrived_ns
         if span_ns < SECOND_NS // 2:
             return None
-        return (last.sent_ns - first.sent_ns) / span_ns, _arrival_bps(first, last)
+        # A keyframe behind a small frame comes later by its own length, which is no queue.
+        longer_ns = max(0, last.serialization_ns - first.serialization_ns)
+        return (last.sent_ns - first.sent_ns + longer_ns) / span_ns, _arrival_bps(first, last)
 
     def _lately_proven_bps(self) -> float:
         # A multiple of the arrival rate of about the last second; the present rate if that is not known yet.

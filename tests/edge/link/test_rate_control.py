@@ -81,6 +81,13 @@ def test_a_steady_link_above_the_budget_is_found_within_seconds_and_kept(found_s
     assert flight.held <= held
 
 
+def test_a_keyframe_behind_a_small_frame_is_no_queue_as_a_flight_begins():
+    """A camera of one frame a second stayed at half of its budget for the first quarter of a minute."""
+    one_a_second = {"size": (1920, 1080), "budget": 400_000, "fps": 1, "window": 2.0, "video_share": 0.85}
+    flight = flown(15, (0, 520_000), method="M6", **one_a_second)
+    assert min(flight.rate_between(5, 15)) == 400_000
+
+
 @pytest.mark.parametrize(("kbps", "soon_s", "most_s"), [(60, 10, 8), (150, 5, 3), (300, 3, 1.5)])
 def test_a_link_far_below_the_budget_is_not_overrun_at_the_start(kbps, soon_s, most_s):
     """A pilot with a thin radio who forgot ``--budget`` would see the picture of ten seconds ago, or none at all."""
