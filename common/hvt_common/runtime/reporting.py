@@ -193,9 +193,8 @@ def _first_of(path: Path, before: object) -> Iterator[bool]:
     real = Path(os.path.realpath(path))
     lock = real.with_name(f"{real.name}.lock")
     file = os.open(lock, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    is_ours = takes_lock(file) and bool(
-        os.fstat(file).st_nlink
-    )  # its last holder may have removed it just now
+    # Its last holder may have removed it just now: that lock is nobody's.
+    is_ours = takes_lock(file) and os.fstat(file).st_nlink > 0
     try:
         yield is_ours and version_of(path) in (before, ())
     finally:

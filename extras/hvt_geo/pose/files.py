@@ -261,9 +261,8 @@ def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
         raise UserError(f"pose file {path} lacks the column {missing[0]}")
     for number, line in enumerate(lines, 1):
         where = f"pose file {path}, row {number}"
-        surplus = line.get(
-            None, ()
-        )  # csv keeps the rest there: a comma at the end, or a word, moves no value
+        # csv keeps the rest there: a comma at the end, or a word, moves no value.
+        surplus = line.get(None, ())
         if surplus and (len(surplus) > 1 or not line[last].strip() or surplus[0].strip(" +-")[:1].isdigit()):
             yield UserError(
                 f"{where} has more values than there are columns: is a decimal comma one of them?"

@@ -341,7 +341,7 @@ class SessionFactory:
         config = self.config
         facts = {
             "method": info.method,
-            "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
+            "budget": bitrate_text(info.budget_bps),
             "source": f"{info.source_size[0]}x{info.source_size[1]}",
             "detector": Path(config.detector).name,
             "classifier": Path(config.classifier or "none").name,

@@ -15,17 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from hvt_edge.stills.policy.base import Method, Request, Step, ranked
-
-if TYPE_CHECKING:
-    from hvt_edge.perception.candidates import Candidate
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.class_names import same_kind
 from hvt_common.values import Boxes
+from hvt_edge.stills.policy.base import Method, Request, Step, ranked
 
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
