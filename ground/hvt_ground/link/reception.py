@@ -83,8 +83,9 @@ class Reception:
         note: Callable[[Level, str], None] = lambda _level, _text: None,
     ) -> None:
         self.lockstep = info.pace == "lockstep"
-        self.budget_bps, self.method = info.budget_bps, info.method
-        """As they are now, some seconds late."""
+        self.budget_bps = self.highest_budget_bps = info.budget_bps
+        self.method = info.method
+        """As they are now, some seconds late, and the highest budget since this ground joined."""
         self.ledger = Ledger(window_ns=info.window_ns)
         self.receive_latency, self.overlay_latency = LatencyStats(), LatencyStats()
         self.clock_offset = edge_clock
@@ -125,9 +126,8 @@ class Reception:
         self._from_start = False
         self._missing: Newest[int, int] = Newest(MAX_MISSING_STILLS)
         """Sequence → when it was first missed."""
-        self._arrived_ns = 0
+        self._arrived_ns = self._size_bytes = 0
         self._sizes: deque[tuple[int, int]] = deque()
-        self._size_bytes = 0
         self._delays_ms: deque[float] = deque(maxlen=_MOST_DELAYS)
         self._results: deque[StillResult] = deque(maxlen=_MOST_RESULTS)
         self._news = False
@@ -236,6 +236,7 @@ class Reception:
             budget = bitrate_text(info.budget_bps)
             self._note("info", f"from now on the budget is {budget}, and the method {info.method}")
         self.budget_bps, self.method = info.budget_bps, info.method
+        self.highest_budget_bps = max(self.highest_budget_bps, info.budget_bps)
 
     def time(self, kind: str, item: Received, header: Message, *, handled: bool | None) -> None:
         """Give out when a message came; ``handled``: something was made of it, None is said later."""

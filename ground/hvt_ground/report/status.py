@@ -65,7 +65,7 @@ def summary(session: Session) -> dict[str, Any]:
     return {
         "edge": info.edge,
         "session": f"{info.session_id:08x}",
-        "method": info.method,
+        "method": reception.method,
         "pace": info.pace,
         "frames": reception.frames,
         "frames_decoded": session.frames_decoded,
@@ -73,8 +73,7 @@ def summary(session: Session) -> dict[str, Any]:
         "edge_frames": None if status is None or not status.frames else status.frame_account.as_dict(),
         "duration_s": round(reception.duration_s, 3),
         **account.as_dict(),
-        "budget_bps": info.budget_bps,
-        "budget_base_bps": info.base_bps,
+        "budget_bps": reception.highest_budget_bps,
         "stills": {
             "received": reception.stills,
             "dropped": sum(session.stills_dropped.values()),

@@ -332,6 +332,17 @@ def test_a_state_can_be_written_as_json(ground):
     assert read["edges"][0]["session"]["stills_not_sent"]["base_good"] == 49
 
 
+def test_a_summary_is_of_the_whole_flight_not_of_its_first_second(ground):
+    """After a command "1.6 Mbps, 200 % of 800 kbps" would be no hard budget, of a method that was given up."""
+    session = ground.sessions.session
+    for times, method in ((2, "M1"), (1, "M3")):
+        changes = {"budget_bps": times * session.info.budget_bps, "method": method}
+        session.reception.learn(replace(session.info, **changes))
+    content = ground.end()
+    assert (content["budget_bps"], content["method"]) == (2 * session.info.budget_bps, "M3")
+    assert "budget_base_bps" not in content, "it follows the link, and no ground is told"
+
+
 def test_a_part_of_the_edge_fails_since_it_stopped(ground):
     """A camera that is gone for a minute would be gone "since two seconds": each try is a new failure."""
     at_ns, reception = 1_790_000_000 * SECOND_NS, ground.sessions.session.reception
