@@ -6,13 +6,13 @@ A script is a pure function of the file, the length and the seed: relay and name
 import itertools
 import math
 import random
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from hvt_common.errors import UserError
+from hvt_common.files import read_text, toml_table
 from hvt_common.units import parse_bitrate, parse_duration_s, parse_share
 from lab.link.timeline import LinkState, Phase, Script
 
@@ -60,12 +60,12 @@ def load_scenario(name: str | Path) -> Scenario:
     """
     path = Path(name) if str(name).endswith(".toml") else SCENARIOS / f"{name}.toml"
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = toml_table(read_text(path))
     except FileNotFoundError:
         raise UserError(
             f"scenario {str(name)!r} is unknown: there are {', '.join(scenario_names())}"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+    except (ValueError, RecursionError, OSError) as error:
         raise UserError(f"{path}: not a scenario: {error}") from None
     return _scenario(path.stem, content)
 
@@ -79,7 +79,7 @@ def _scenario(name: str, content: dict[str, Any]) -> Scenario:
     parse_bitrate(content["budget"], name=f"{name}: budget")
     bars = _table(content, "bars", where=name, needed=False)
     for measure, bar in bars.items():
-        if not isinstance(bar, str) or bar.split()[0] not in ("<=", ">=", "=="):
+        if not isinstance(bar, str) or bar.split()[:1] not in (["<="], [">="], ["=="]):
             raise UserError(f"{name}: bar {measure!r} is {bar!r}: write '<= 2', '>= 97' or '== 0'")
     transport = content.get("transport", "tcp")
     if transport not in ("tcp", "udp", "quic"):
@@ -241,7 +241,9 @@ def _within(spans: Sequence[tuple[float, float]], t_s: float) -> bool:
 def _queue(link: Mapping[str, Any], *, where: str) -> int:
     text = str(link.get("queue", "32kB"))
     number = text.removesuffix("kB").strip()
-    size = round(1000 * float(number)) if text.endswith("kB") and number.replace(".", "", 1).isdigit() else 0
+    size = (
+        round(1000 * float(number)) if text.endswith("kB") and number.replace(".", "", 1).isdecimal() else 0
+    )
     if not 4000 <= size <= _MAX_QUEUE_BYTES:
         raise UserError(f"{where}: queue {text!r} is not usable: write 32kB, at least 4kB and at most 4000kB")
     return size

@@ -93,6 +93,7 @@ def test_bits_leave_only_in_light():
         (('rate = "1Mbps"', 'rate = "1Mbps"\nspeed = 3'), "'speed' is not a setting; there are burst, delay"),
         (('rate = "1Mbps"', 'rate = "1Mbps"\nloss = "95%"'), "loss '95%' is too much"),
         (('rate = "1Mbps"', 'rate = "1Mbps"\nqueue = "1kB"'), "queue '1kB' is not usable"),
+        (('rate = "1Mbps"', 'rate = "1Mbps"\nqueue = "32²kB"'), "queue '32²kB' is not usable"),
         (('rate = "1Mbps"', 'rate = "1Mbps"\ndelay = "9s"'), "delay '9s' is too much"),
         (("[link]", 'transport = "sctp"\n[link]'), "transport 'sctp' is not usable: tcp, udp or quic"),
         (('lasts = "10s"', 'lasts = "0s"'), "lasts 0 s is not usable"),
@@ -109,7 +110,10 @@ def test_bits_leave_only_in_light():
         (("[short]", '[bars]\n"x" = "about 3"\n[short]'), "write '<= 2'"),
         (("[full]", "[fill]"), "'fill' is not a setting"),
         (('budget = "800kbps"', ""), "budget is missing"),
+        (("[full]", '[bars]\n"x" = ""\n[full]'), "bar 'x' is ''"),
         (("[link]", "[link"), "not a scenario"),
+        (("[link]", f"x = {'[' * 5000}\n[link]"), "not a scenario"),
+        (("[link]", f"{'a.' * 5000}a = 1\n[link]"), "has more than 32 parts"),
     ],
 )
 def test_what_cannot_be_used_is_named(tmp_path, change, sentence):

@@ -8,14 +8,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 _FULL_FRAME_MM = 36.0
 """Width of the picture that 35 mm equivalent focal lengths are said for."""
-_NUMBER = r"[+-]?\d++(?:[.,]\d++)?+(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d)"
-"""With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06'01"."""
+_NUMBER = r"[+-]?(?:\d++[.,]\d++|\d++(?! \d))(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d|\.\d)"
+"""With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06, 47 06.1, 47.06.01."""
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
-_LETTER = r"(?:\s?°?\s?([EWNS])\b(?!\s*:))?"
-_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}{_LETTER}")
-_HEMISPHERES = re.compile(rf"([EWNS])\s*:\s*({_NUMBER})|({_NUMBER}){_LETTER[:-1]}")
-"""Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter behind the number, of one of both at least."""
+_SIDE = r"(?i:([EWNS]|east|west|north|south))"
+_BEHIND = rf"\s?°?\s?{_SIDE}\b(?!\s*:)"
+_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}(?:{_BEHIND})?")
+_HEMISPHERES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER}){_BEHIND}")
+"""Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter or word behind the number, of one of both at least."""
+_UNREAD = re.compile(
+    r"\d\s+\d|(?<![^\W\d_])(?!(?i:[ewnsm]|east|west|north|south|ft|feet|sats?)(?![^\W\d_]))[^\W\d_]"
+)
+"""Degrees and minutes, or a word that is no unit and no side: such a place is not read."""
 _GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
 _HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})(?:\s*m\b|{_FEET[3:-2]})")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
@@ -85,7 +90,7 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
             value = _value(said, feet=feet)
             value = value / parts if said.isdecimal() and value > least else value
             column = _DJI[name.lower()]
-            row[column] = -abs(value) if letter == _NEGATIVE.get(column) else value
+            row[column] = -abs(value) if letter[:1].upper() == _NEGATIVE.get(column) else value
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
         row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
@@ -94,11 +99,11 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
 
 def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
     found = _GPS.search(body)
-    if found is None:
+    if found is None or _UNREAD.search(found[1]):
         return {}
     place = _numbers(found[1])
     if letters := _HEMISPHERES.findall(found[1]):
-        values = [(before or behind, _value(one or two)) for before, one, two, behind in letters]
+        values = [((before or behind)[0].upper(), _value(one or two)) for before, one, two, behind in letters]
         said = {
             "longitude_deg" if letter in "EW" else "latitude_deg": -abs(value) if letter in "WS" else value
             for letter, value in values  # some write the sign as well
