@@ -169,16 +169,19 @@ class FolderSource(Source):
 def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.0) -> Image | None:
     """(height, width, 3) uint8 BGR, turned by its EXIF data; None where it is no picture that can be read.
 
-    Deep grey is a sensor's levels: ``stretch`` has those of the pictures before; ``at_s`` is the time at which it is
-    shown, in seconds.
+    More than eight bits are a sensor's levels: ``stretch`` has those of the pictures before; ``at_s`` is the time at
+    which it is shown, in seconds.
     """
     try:
         data = np.fromfile(file, np.uint8)
         if not data.size:
             return None
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        deep = stretch or Stretch(lambda _: None)
         if image is not None and image.itemsize > 1 and image.ndim == 2:
-            return (stretch or Stretch(lambda _: None)).bgr(image, at_s=at_s)
+            return deep.bgr(image, at_s=at_s)
+        if image is not None and image.dtype == np.uint16:
+            return deep.colours(np.asarray(image, np.uint16)[..., :3])
         # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     except (OSError, cv2.error):  # it has just gone, or its header claims too large a size

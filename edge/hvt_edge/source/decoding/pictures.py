@@ -9,6 +9,7 @@ from typing import Any
 
 import av
 import av.error
+import cv2
 import numpy as np
 import numpy.typing as npt
 from av.filter import Graph
@@ -26,6 +27,8 @@ _UNTAGGED_SD_PX = 576
 """A picture without a colour matrix is BT.601 up to this number of lines, else BT.709, as in players."""
 _DEEP_BITS = 10
 """Grey of more bits is a sensor's levels, not brightness."""
+_SENSOR_BITS, _MOST_BITS = (10, 12, 14), 16
+"""Cameras leave the upper ones of sixteen bits empty, and no header says so."""
 _COLOURS = 3
 """Components of a pixel in colour: a palette has one, grey with transparency two."""
 _HDR = {16: "PQ", 18: "HLG"}
@@ -130,13 +133,20 @@ class Pictures:
     def _upright_colours(self, frame: av.VideoFrame) -> Image:
         wide, high = self._square(frame)
         name, components = frame.format.name, frame.format.components
-        if name.startswith("gray") and not name.startswith("grayf") and components[0].bits > _DEEP_BITS:
+        if (
+            name.startswith(("gray", "ya16"))
+            and not name.startswith("grayf")
+            and components[0].bits > _DEEP_BITS
+        ):
             levels = self._reformatter.reformat(
                 frame, width=wide, height=high, format="gray16le", threads=1
             ).to_ndarray()
             bits = components[0].bits
             own = np.asarray(levels, np.uint16) >> (16 - bits)
             return self._stretch.bgr(own, at_s=frame.time or 0.0, bits=bits)
+        if frame.format.is_rgb and components[0].bits == _MOST_BITS and frame.color_trc not in _HDR:
+            deep = self._reformatter.reformat(frame, width=wide, height=high, format="bgr48le", threads=1)
+            return self._stretch.colours(np.asarray(deep.to_ndarray(), np.uint16))
         more: dict[str, Any] = {}
         if len(components) >= _COLOURS:
             if not frame.format.is_rgb and frame.colorspace not in _CONVERTED:
@@ -237,7 +247,7 @@ _EACH = 4
 
 
 class Stretch:
-    """A sensor's levels as eight bits: between their percentiles 0.5 and 99.5.
+    """A sensor's levels as eight bits: those of grey between their percentiles 0.5 and 99.5.
 
     These follow the scene with a time constant of three seconds.
 
@@ -248,6 +258,18 @@ class Stretch:
         self._note = note
         self._range: tuple[float, float] | None = None
         self._at_s = 0.0
+        self._bits = 0
+        """Of colours: as many as the brightest so far needs."""
+
+    def colours(self, levels: npt.NDArray[np.uint16]) -> Image:
+        """(height, width, 3) BGR of sixteen bits, of which a camera may use the lower ones alone, as uint8."""
+        needed = int(levels.max()).bit_length()
+        bits = next((bits for bits in _SENSOR_BITS if needed <= bits), _MOST_BITS)
+        if bits > self._bits:
+            self._bits = bits
+            if bits < _MOST_BITS:
+                self._note(f"its 16-bit colours go up to {levels.max()}: they are taken for {bits} bits")
+        return np.asarray(cv2.convertScaleAbs(levels, alpha=255 / (2**self._bits - 1)), np.uint8)
 
     def bgr(self, levels: npt.NDArray[Any], *, at_s: float, bits: int = 0) -> Image:
         """(height, width) numbers as (height, width, 3) uint8; ``at_s`` is the picture's time in seconds.

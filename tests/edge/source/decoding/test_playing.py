@@ -321,6 +321,19 @@ def test_pictures_of_heat_in_a_folder_are_stretched_too(tmp_path, unseen):
         assert "stretched" in " ".join(source.notes)
 
 
+@pytest.mark.parametrize(("most", "bits"), [(1000, 10), (4095, 12), (16_000, 14), (65_535, 16)])
+def test_colours_of_a_sensor_are_as_bright_as_its_bits(tmp_path, most, bits):
+    """Twelve bits in a TIFF or PNG of sixteen were nearly black, without a word."""
+    levels = np.full((60, 80, 3), (0, most // 2, most), np.uint16)
+    for name in ("0.tiff", "0.png"):
+        cv2.imwrite(str(tmp_path / name), levels)
+    share = most / (2**bits - 1)
+    for place in (tmp_path / "0.tiff", tmp_path / "0.png", tmp_path):
+        source, pictures = play(place)
+        assert pictures[0][30, 40].tolist() == pytest.approx([0, 127.5 * share, 255 * share], abs=2)
+        assert (f"taken for {bits} bits" in " ".join(source.notes)) == (bits < 16)
+
+
 @pytest.mark.parametrize(
     ("names", "says"),
     [
