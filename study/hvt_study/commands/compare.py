@@ -172,6 +172,8 @@ SIMPLEST_FIRST: Mapping[str, tuple[str, ...]] = MappingProxyType(
 )
 """Names of `COMPARED`, from the one with the fewest parts on, with the names of ``hvt-edge``."""
 _STALE_MS = 500
+_MEASURES = {"named_f1": "named F1", "recall": "recall"}
+"""Recall where one target is labelled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,17 +215,13 @@ def _source(plan: ComparePlan) -> tuple[str, ...]:
 
 
 def _verdict(plan: ComparePlan, rate_kbps: float, rows: Mapping[str, CompareRow]) -> Verdict:
-    measure, name = next(
-        (
-            (measure, name)
-            for measure, name in (("named_f1", "named F1"), ("recall", "recall"))
-            if any(row[measure] is not None for row in rows.values())
-        ),
-        ("named_f1", "named F1"),
-    )
-    worth = {method: row[measure] or 0.0 for method, row in rows.items()}
-    most = max(worth.values())
     begins = f"At {rate_kbps:g} kbps"
+    known = [one for one in _MEASURES if any(row[one] is not None for row in rows.values())]
+    if not known:
+        return Verdict(f"{begins} nothing can be judged: no object of the clip counts.", "")
+    name = _MEASURES[known[0]]
+    worth = {method: row[known[0]] or 0.0 for method, row in rows.items()}
+    most = max(worth.values())
     if not most:
         return Verdict(f"{begins} no method shows anything right ({name} .000).", "")
     chosen = next(method for method in SIMPLEST_FIRST if method in worth and most - worth[method] < NOISE)

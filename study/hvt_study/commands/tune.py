@@ -147,6 +147,8 @@ def _flown(
     for row in rows:
         if row["failed"] and not texts:
             raise UserError(f"{method} cannot be flown over {row['sequence']}: {row['failed']}")
+        if not row["failed"] and row["recall"] is None:
+            raise UserError(f"{row['sequence']} has no object that counts, to tune for: leave it out")
     return rows
 
 

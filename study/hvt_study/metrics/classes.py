@@ -85,15 +85,16 @@ class ClassScore:
 
     @property
     def f1(self) -> float:
-        """2 found / (labels + boxes), whatever the classes; 1 where nothing was there and nothing shown."""
-        total = self.counts.labels + self.boxes
-        return 2 * self.counts.found / total if total else 1.0
+        """2 found / (labels + boxes), whatever the classes; NaN without labels."""
+        return self._f1(self.counts.found)
 
     @property
     def named_f1(self) -> float:
-        """2 right / (labels + boxes); 1 where nothing was there and nothing shown."""
-        total = self.counts.labels + self.boxes
-        return 2 * self.counts.right / total if total else 1.0
+        """2 right / (labels + boxes); NaN without labels."""
+        return self._f1(self.counts.right)
+
+    def _f1(self, hits: int) -> float:
+        return 2 * hits / (self.counts.labels + self.boxes) if self.counts.labels else math.nan
 
     @property
     def false_per_frame(self) -> float:

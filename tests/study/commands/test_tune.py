@@ -63,7 +63,8 @@ def test_of_one_target_recall_is_searched_for():
 
     class Flown(Executor):
         def submit(self, _, spec):
-            row = {"named_f1": None, "recall": 0.5 + 0.1 * bool(spec.tune), "failed": "", "total_bps": 1}
+            recall = None if spec.sequence == "empty" else 0.5 + 0.1 * bool(spec.tune)
+            row = {"named_f1": None, "recall": recall, "failed": "", "total_bps": 1}
             done = Future()
             run = {"dataset": spec.dataset, "sequence": spec.sequence, "regime": spec.regime}
             done.set_result(run | row)
@@ -73,6 +74,8 @@ def test_of_one_target_recall_is_searched_for():
     own = {"method": "M5", "parameters": tunable("M5"), "train": train, "held_out": held_out, "trials": 1}
     found = tune(plan, **own, pool=Flown())
     assert (found["train_default"], found["held_out_gain"]) == (0.5, pytest.approx(0.1))
+    with pytest.raises(UserError, match="empty has no object that counts, to tune for: leave it out"):
+        tune(plan, **own | {"train": [("mot:a", "empty")]}, pool=Flown())
 
 
 def test_the_help_says_a_default_once_and_none_where_there_is_none(capsys):

@@ -65,6 +65,8 @@ FEWER = ", .110 more than the next, M0-fps."
         ),
         # A command would be printed that shows nothing.
         ([row("M0", 0.0), row("M6", 0.0)], "no method shows anything right", " (named F1 .000)."),
+        # A 0 would be said of what nobody knows.
+        ([row("M0", None), row("M6", None)], "nothing can be judged", "no object of the clip counts."),
     ],
 )
 def test_the_best_one_is_named_with_its_lead(rows, begins, ends):

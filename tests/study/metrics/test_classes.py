@@ -91,16 +91,17 @@ def test_what_merely_moves_is_found_and_has_no_class():
 
 
 def test_nothing():
-    """Empty sequences, blind grounds and empty roads are answers, not crashes."""
+    """Empty sequences, blind grounds and empty roads are answers, not crashes; unknown figures are no 1 and no 0."""
     empty = class_score(judged([]))
-    assert (empty.counts, empty.f1) == (ClassCounts(), 1.0)
-    assert math.isnan(empty.macro_f1_all)
+    assert empty.counts == ClassCounts()
+    assert all(map(math.isnan, (empty.macro_f1_all, empty.f1, empty.named_f1, empty.precision)))
     blind = class_score(judged([(labels((square(0), "car")), FrameView())]))
     assert (blind.counts.top1_all, blind.macro_f1_all, blind.recall, blind.f1) == (0.0, 0.0, 0.0, 0.0)
     assert math.isnan(blind.counts.top1_found)
     assert math.isnan(blind.macro_f1_found)
     ghosts = class_score(judged([(labels(), view((square(0), "car")))]))
-    assert (ghosts.precision, ghosts.f1) == (0.0, 0.0)
+    assert (ghosts.precision, ghosts.false_per_frame) == (0.0, 1.0)
+    assert all(map(math.isnan, (ghosts.recall, ghosts.f1, ghosts.named_f1)))
 
 
 def sequence(*lives):
