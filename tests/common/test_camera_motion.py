@@ -18,7 +18,6 @@ WIDTH, HEIGHT = 640, 360
 
 @pytest.fixture(scope="module")
 def ground(data):
-    """A real aerial photograph, 1068 x 580."""
     return cv2.imread(str(data / "aerial_highway.jpg"))
 
 
@@ -35,7 +34,6 @@ def shot(ground, camera, rng):
 
 
 def between(a, b):
-    """The true map from the image of camera a to that of b."""
     square = [np.vstack((camera, [0, 0, 1])) for camera in (a, b)]
     return (square[1] @ np.linalg.inv(square[0]))[:2]
 

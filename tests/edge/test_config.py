@@ -16,7 +16,6 @@ from hvt_edge.video.encoder import keyframe_floor_bytes
 
 
 def read(*argv: str) -> tuple[EdgeConfig, Any]:
-    """What a command line gives, before it is checked."""
     return load(EdgeConfig, ["--source", "demo", *argv], program="hvt-edge", description="")
 
 

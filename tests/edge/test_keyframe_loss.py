@@ -35,7 +35,6 @@ class Ground:
         self.seen: set[int] = set()
 
     def send(self, header: UnitHeader, now_ns: int) -> None:
-        """On its way, or lost; the first is not."""
         if header.sequence == 0 or self.random.random() >= self.loss:
             self.air.append((now_ns + self.way_ns, header))
 

@@ -25,7 +25,6 @@ def summary_of(
     failed: tuple[Failure, ...] = (),
     unreached: str = "",
 ) -> dict[str, Any]:
-    """Of a short flight."""
     says = "no tracks: the video hides 0 objects; stills: they name 2 of 3 otherwise"
     now = SimpleNamespace(
         method="M6",

@@ -28,7 +28,6 @@ ALIVE = "hvt/uav-1/alive"
 
 
 def config(port: int, folder: Path | None, **changes: Any) -> GroundConfig:
-    """A light ground."""
     light = {"detector": "motion", "classifier": "none", "quiet": True}
     return check(GroundConfig(listen=(f"tcp/127.0.0.1:{port}",), record=folder, **light, **changes))
 
@@ -185,7 +184,6 @@ class Brings(Extra):
 
 @pytest.fixture
 def service(monkeypatch) -> Service:
-    """Of the one extra that is there."""
     brings = Brings()
     monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: (brings,))
     return brings.service
@@ -264,7 +262,6 @@ class Failing(threading.Event):
     """What a run is stopped by, where even that goes wrong."""
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Not this time."""
         raise RuntimeError("can't start new thread")
 
 

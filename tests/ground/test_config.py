@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hvt_common.config import load, to_toml
+from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_common.files import has_nothing
 from hvt_ground.config import GroundConfig
@@ -20,7 +20,6 @@ from hvt_ground.wiring.sessions import backlog_path, free_path, open_again
 
 
 def read(*argv: str) -> GroundConfig:
-    """What a command line gives."""
     return checked(load(config_class(), list(argv), program="hvt-ground", description="")[0])
 
 
@@ -104,16 +103,6 @@ def test_a_file_in_a_folder_that_is_not_there_is_refused(words):
     option, file = words.split()
     with pytest.raises(UserError, match=f"{option} absent/{file} is in a folder that does not exist"):
         check_outputs(read(option, f"absent/{file}"))
-
-
-def test_what_is_printed_reads_back_the_same(tmp_path):
-    """``--print-config`` could not be kept and used again."""
-    words = "--listen tcp/127.0.0.1:7447 --listen tls/[::1]:7448 --insecure --edges uav-* --detect-every 3"
-    words += " --confidence 0.123 --nms-iou 0.7 --classifier c.onnx --refine fuse --wait 1.5s --once --view"
-    config = read(*words.split(), "--detector", "a b.onnx", "--record", "folder/with [1].rrd")
-    path = tmp_path / "ground.toml"
-    path.write_text(to_toml(config), encoding="utf-8")
-    assert load(config_class(), ["--config", str(path)], program="hvt-ground", description="")[0] == config
 
 
 def test_no_recording_is_written_over_another(tmp_path):

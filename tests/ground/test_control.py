@@ -88,7 +88,6 @@ class ScriptedEdge:
 
 @pytest.fixture
 def edge(free_port, monkeypatch) -> Iterator[ScriptedEdge]:
-    """One that listens."""
     monkeypatch.setattr(control, "ANSWER_S", PATIENT_S)
     scripted = ScriptedEdge(free_port)
     with (
@@ -101,7 +100,6 @@ def edge(free_port, monkeypatch) -> Iterator[ScriptedEdge]:
 
 @pytest.fixture
 def uav(edge) -> Iterator[RemoteEdge]:
-    """The same, as one asks it."""
     with EdgeClient.connect(edge.endpoint) as edges:
         yield edges["uav-1"]
 

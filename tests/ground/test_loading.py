@@ -50,7 +50,6 @@ class Compiler:
 
 @pytest.fixture
 def compiler(monkeypatch: pytest.MonkeyPatch):
-    """It ends with the test."""
     compiler = Compiler(monkeypatch)
     yield compiler
     compiler.done.set()

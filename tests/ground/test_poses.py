@@ -9,7 +9,6 @@ SECOND_NS = 1_000_000_000
 
 
 def pose(second: float, *, north: float = 0.0, yaw: float = 0.0) -> Pose:
-    """On its way north."""
     at_ns, latitude_deg = round(second * SECOND_NS), 50.0 + north / 111_229
     return Pose(at_ns, latitude_deg, 10.0, height_m=50.0, camera=Orientation(yaw, -60, 0))
 

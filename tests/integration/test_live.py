@@ -32,7 +32,6 @@ def arguments(scene: Path, edge_id: str, *more: str) -> list[str]:
 
 
 def count_frames(file: Path) -> int:
-    """How many frames of a video file a player shows."""
     with av.open(str(file)) as container:
         return sum(1 for _ in container.decode(container.streams.video[0]))
 

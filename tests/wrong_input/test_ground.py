@@ -113,16 +113,6 @@ def test_words_that_cannot_be_meant_so(ground, words, told):
     assert [one for one in told if one not in sentence] == []
 
 
-def test_files_of_settings_that_are_wrong(ground, here):
-    """The ground would start with other settings than those in its file."""
-    Path("ground.toml").write_text("refine = \n")
-    assert "not valid TOML" in ground("--config", "ground.toml")
-    Path("ground.toml").write_text("sauce = 'tomato'\n")
-    assert "unknown key 'sauce'" in ground("--config", "ground.toml")
-    Path("zenoh.json5").write_text("{ mode: ")
-    assert "zenoh.json5:1 is not JSON5" in ground("--zenoh-config", "zenoh.json5")
-
-
 def test_a_classifier_with_no_class_in_common(ground, tmp_path):
     """It would fly, and never say a word of any track."""
     names = tmp_path / "fruit.txt"

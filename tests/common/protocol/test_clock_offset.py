@@ -16,7 +16,6 @@ delays = st.integers(0, 5_000 * MS)
 
 
 def exchange(clock, *, at_ns, offset_ns, out_ns, held_ns, back_ns):
-    """A question at ``at_ns`` to a clock that is ``offset_ns`` ahead."""
     heard = at_ns + out_ns
     return clock.add(
         t0_ns=at_ns,

@@ -25,7 +25,6 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def seen(*boxes, confidence=0.9, class_id=0):
-    """Detections x1 y1 x2 y2 of equal confidence and class."""
     return detections(boxes, confidence, class_id)
 
 

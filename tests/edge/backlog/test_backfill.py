@@ -130,16 +130,6 @@ def test_the_facts_of_a_former_session_come_before_its_objects(tmp_path):
         assert folder.info_of(7) is None, "nothing is left"
 
 
-def test_a_ground_that_asks_for_the_facts_gets_them(rig, folder):
-    """A ground that was started again could make nothing of what comes."""
-    fill(folder)
-    # it is the present session: its facts are not sent unasked
-    rig.ground.knows = set()
-    rig.run(30)
-    assert (7, "info", 0) in rig.ground.objects
-    assert len(rig.ground.objects) == 10
-
-
 @pytest.mark.parametrize("loss", [0.1, 0.2])
 def test_lost_pieces_and_reports_cost_time_and_nothing_else(folder, loss):
     """A lossy link would leave holes, or begin everything anew."""

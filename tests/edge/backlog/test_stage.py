@@ -9,7 +9,6 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
 from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.backlog.entry import worth
 from hvt_edge.backlog.worker import IntakeStill, StoreWorker
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.wiring.link import channels_of
@@ -107,16 +106,6 @@ def test_a_kept_still_is_as_it_would_have_come_and_takes_its_budget(tmp_path):
     assert (kept.payload, kept.encoding) == (STILL.data, "image/jpeg")
     assert (header.sequence, header.session_id, header.flags & Flags.STORED) == (2**31, 7, Flags.STORED)
     assert not [row for row, _, _ in rig.out.puts if row is Channel.ROI]
-
-
-def test_stills_that_the_outage_took_are_known_with_their_worth(tmp_path):
-    """What was on its way would be lost, or come back as worth nothing."""
-    rig = Rig(tmp_path / "store")
-    rig.play(0, 5, linked=True)
-    rig.still(0, utility=2.5)
-    rig.play(5, 8, linked=False)
-    rig.stills.store_lost(rig.now_ns)
-    assert rig.stored_stills() == {0: worth(2.5, STILL.header.capture_ns)}
 
 
 def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, caplog):

@@ -17,7 +17,6 @@ from rigs.command_rig import FRAME_NS, SESSION, VIEW, Rig, picture
 
 
 def shown(header: RoiHeader, data: bytes) -> np.ndarray:
-    """The decoded crop."""
     x1, y1, x2, y2 = header.crop_source_px
     size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
     return still_codec(header.codec).decode(data, size=size, parameters=header.parameters)

@@ -31,7 +31,6 @@ class Faulty(FeedbackInbox):
     broken = False
 
     def on_report(self, report):
-        """As it is, or not at all."""
         if self.broken:
             raise OverflowError("too much")
         super().on_report(report)

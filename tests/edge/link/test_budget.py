@@ -61,7 +61,6 @@ class Run:
 
 
 def frame_times(count: float, fps: float = 15) -> Iterator[tuple[int, int]]:
-    """Numbers and times of frames."""
     return ((number, START_NS + round(number * SECOND_NS / fps)) for number in range(round(count)))
 
 

@@ -193,7 +193,6 @@ class Machine:
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch) -> Machine:
-    """Of `counts`."""
     made = Machine(tmp_path / "stat")
     made.passes(0.0, own_s=0.0)
     clocks = SimpleNamespace(monotonic=lambda: made.wall_s, process_time=lambda: made.own_s)

@@ -31,7 +31,6 @@ SMALL = SourceSettings(size=(64, 64), fps=25)
 
 @pytest.fixture
 def quick(monkeypatch):
-    """A lost camera is tried again at once, and a wait for its picture is short."""
     monkeypatch.setattr(live, "FIRST_WAIT_NS", 20 * MS)
     monkeypatch.setattr(live, "IDLE_S", 0.05)
 

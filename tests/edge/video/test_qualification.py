@@ -42,7 +42,6 @@ class Garbled(BaseEncoder):
 
 
 def headroom(scene=SCENE, kind: type[BaseEncoder] = BaseEncoder, **behaviour: float) -> float:
-    """What such an encoder is given."""
     return headroom_of(
         "acme",
         open_at=partial(opened, kind=kind, **behaviour),

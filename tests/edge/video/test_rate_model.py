@@ -140,7 +140,6 @@ def test_the_rate_is_kept_whatever_is_missed(decimation, frames):
 
 
 def measured(decimation: int = 1) -> MeasuredFrameSkip:
-    """As at 15 frames a second."""
     return MeasuredFrameSkip(decimation, most_decimation=7, rest_frames=150, window_frames=150)
 
 

@@ -29,8 +29,6 @@ def coded(encoder, *, keyframes):
 
 @pytest.fixture
 def installed(packages):
-    """Installs encoders for one test, by their class."""
-
     def put(*classes: str, module: str = "acme_encoders", **names: str) -> None:
         parts = {f"acme-{one.lower()}": one for one in classes} | names
         packages(parts, module=module, source=ENCODERS, group="hvt.encoders")

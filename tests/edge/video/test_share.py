@@ -17,7 +17,6 @@ SECOND = 1_000_000_000
 
 
 def moment(seconds: float, *, from_source: bool = False) -> Step:
-    """A decision step."""
     return decision_step(
         round(seconds * 15),
         now_ns=round(seconds * SECOND),
@@ -28,7 +27,6 @@ def moment(seconds: float, *, from_source: bool = False) -> Step:
 
 
 def car(track_id: int, *, lost: float, confidence: float = 0.6, side: float = 30, **changes) -> Candidate:
-    """A track, and what the base lost of it."""
     box = (100.0, 100.0, 100 + side, 100 + side)
     plain = {"frame_index": 0, "confidence": confidence, "crop_area_px": 1.69 * side * side}
     return candidate(track_id, box, **(plain | {"loss": lambda: BaseLoss(28.0, lost)} | changes))

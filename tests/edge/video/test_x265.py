@@ -25,7 +25,6 @@ VPS, SPS, PPS, IDR, FILLER = 32, 33, 34, (19, 20), 38
 
 
 def settings(**changes) -> EncoderSettings:
-    """A small stream."""
     return EncoderSettings(**{"size": SIZE, "fps": 15.0, "bitrate_bps": 200_000} | changes)
 
 
@@ -42,7 +41,6 @@ def is_idr(data: bytes) -> bool:
 
 
 def encode(pictures, keyframes=(), regions=lambda _index: (), **changes):
-    """Access units of pictures."""
     encoder = BaseEncoder(settings(**changes))
     return [
         encoder.encode(frame, keyframe=frame.index in keyframes, regions=regions(frame.index))
@@ -51,7 +49,6 @@ def encode(pictures, keyframes=(), regions=lambda _index: (), **changes):
 
 
 def decoded(units):
-    """Pictures; None for a unit that cannot be shown."""
     decoder = BaseDecoder()
     return [decoder.decode(unit.data) for unit in units]
 
@@ -268,7 +265,6 @@ def test_a_new_encoder_goes_on_in_the_same_stream():
 
 
 def still_scene(count: int, *, noise: float) -> list[np.ndarray]:
-    """What a camera that does not move gives."""
     chance, scene = np.random.default_rng(5), hard_pictures(1, size=SIZE)[0].astype(np.float64)
     grain = (chance.normal(0, noise, scene.shape) for _ in range(count))
     return [np.clip(scene + one, 0, 255).astype(np.uint8) for one in grain]
@@ -297,7 +293,6 @@ WIDE = (640, 360)
 
 
 def tracks(*boxes, confidences=None) -> Tracks:
-    """Tracks at these boxes."""
     return tracks_of(0, boxes, confidences=0.5 if confidences is None else confidences)
 
 

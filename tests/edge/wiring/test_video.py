@@ -38,7 +38,6 @@ def test_no_source_is_enlarged(source, letterbox, crop):
 
 
 def settled(flags: str = "") -> EdgeConfig:
-    """The settings as a start takes them."""
     words = ["--source", "x.mp4", *flags.split()]
     config, loaded = load(EdgeConfig, words, program="hvt-edge", description="")
     return check(with_profile(config, given=loaded.values))

@@ -36,7 +36,6 @@ class Patient(threading.Thread):
     """Is waited for until it has ended, or hangs."""
 
     def join(self, timeout: float | None = None) -> None:
-        """See there."""
         assert timeout == 0.3
         eventually(lambda: self in HUNG or not self.is_alive())
 

@@ -36,7 +36,6 @@ def small_scene(folder: Path) -> str:
 
 
 def examined(capsys, program: Program, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
-    """Exit code, and the findings by name."""
     code = program(["doctor", "--json", *words])
     return code, {row["check"]: row for row in json.loads(capsys.readouterr().out)}
 

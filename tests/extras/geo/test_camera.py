@@ -16,7 +16,6 @@ MIDDLE = (500.0, 250.0)
 
 
 def metres(pose: Pose, *points: tuple[float, float]) -> np.ndarray:
-    """North and east of the camera's foot."""
     return ground_points(pose, np.array(points), size=SIZE)
 
 

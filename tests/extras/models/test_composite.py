@@ -16,7 +16,6 @@ GREY = np.full((180, 320, 3), 100, np.uint8)
 
 
 def still(crop: tuple[int, int, int, int], image_bgr: Image) -> DecodedStill:
-    """A still of this crop."""
     return DecodedStill(image_bgr, crop, ((0.0, 0.0, 1.0, 1.0),), 0)
 
 

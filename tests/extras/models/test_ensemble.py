@@ -35,12 +35,10 @@ class Says:
         self._found = Detections(boxes, np.array([sure for _, sure, _ in rows], np.float32), ids)
 
     def detect(self, _: Image) -> Detections:
-        """What was said."""
         return self._found
 
 
 def merged(*parts: Says, owns: tuple[float, ...] = (0.25, 0.25)) -> list[Row]:
-    """The rows of these parts together."""
     ensemble = EnsembleDetector(parts, owns, confidence=0.1)
     found = ensemble.detect(PICTURE)
     return [

@@ -33,7 +33,6 @@ def check(detector: OnnxDetector, head: str) -> None:
 
 
 def opened(path: Path, **settings: Any) -> OnnxDetector:
-    """As the programs open it."""
     detector = open_detector(str(path), **settings)
     assert isinstance(detector, OnnxDetector)
     return detector

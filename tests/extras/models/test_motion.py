@@ -17,7 +17,6 @@ VIEW = (960, 540)
 
 
 def overlaps(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(N, M) IoU."""
     low = np.maximum(first[:, None, :2], second[None, :, :2])
     high = np.minimum(first[:, None, 2:], second[None, :, 2:])
     shared = np.maximum(high - low, 0).prod(axis=2)

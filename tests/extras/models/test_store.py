@@ -48,7 +48,6 @@ class Origin(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """The model's address."""
         return f"http://127.0.0.1:{self.server_port}/model.onnx"
 
 
@@ -108,7 +107,6 @@ class _Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def origin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Origin]:
-    """A server on loopback."""
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     server = Origin()
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})

@@ -47,14 +47,12 @@ def port() -> int:
 
 @pytest.fixture
 def local(port) -> Iterator[int]:
-    """A page on loopback."""
     with WebPage(f"127.0.0.1:{port}", clock=time.time_ns):
         yield port
 
 
 @pytest.fixture
 def public(port) -> Iterator[int]:
-    """A page that other machines reach."""
     with WebPage(f"0.0.0.0:{port}", clock=time.time_ns):
         yield port
 
@@ -94,7 +92,6 @@ def asked(port: int, path: str, method: str = "GET", body: bytes = b"", **header
 
 
 def joined(port: int, **more) -> ClientConnection:
-    """A viewer."""
     return connect(f"ws://127.0.0.1:{port}/ws", origin=f"http://127.0.0.1:{port}", open_timeout=10, **more)
 
 

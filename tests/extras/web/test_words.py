@@ -27,7 +27,6 @@ LIVE = {
 
 
 def said(calls: list[tuple[str, list]]) -> list:
-    """What functions of words.js return."""
     return ran(f"""
       import * as words from {WORDS};
       const calls = {json.dumps(calls)};
@@ -140,7 +139,6 @@ def test_a_box_goes_out_of_the_picture_with_its_object():
 
 
 def texts(found: Any) -> list[str]:
-    """All texts within."""
     if isinstance(found, dict):
         return [text for one in found.values() for text in texts(one)]
     return [text for one in found for text in texts(one)] if isinstance(found, list) else [str(found)]
@@ -483,7 +481,6 @@ def given(path: Path, names: set[str]) -> Iterator[str]:
 
 
 def sentences(path: Path) -> Iterator[str]:
-    """All texts of a module."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.expr):
             yield from spoken(node)

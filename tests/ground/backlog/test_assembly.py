@@ -24,7 +24,6 @@ from rigs.footprint import footprint_bytes
 
 
 def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=7) -> BacklogHeader:
-    """Of a chunk."""
     return BacklogHeader(
         session_id=session, kind=kind, number=number, offset=offset, total_bytes=total, send_ns=0
     )

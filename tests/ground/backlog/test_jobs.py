@@ -131,7 +131,6 @@ class Outage:
 
 
 def finish(job: Job) -> None:
-    """Do all steps, as a worker does them."""
     for _ in job:
         pass
 

@@ -39,7 +39,6 @@ from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import SLOTS
 from programs.processes import eventually
 from programs.rrd import Recording
-from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.examples import overlay, seen
 from rigs.flight import (
@@ -107,7 +106,6 @@ class Rig(ReceiverRig):
         self.wait_for(lambda: self.outputs.idle)
 
     def base(self, *indices: int) -> None:
-        """Access units as they come."""
         self.put(*(self.flight.base(index) for index in indices))
 
     def stored(self, kind: str, number: int, data: bytes, *, of: Flight | None = None, **cut):
@@ -127,12 +125,10 @@ class Rig(ReceiverRig):
         self.stored("info", 0, info_object(of), of=of)
 
     def bring(self, items: list[Received]) -> None:
-        """They come, and nobody waits."""
         for item in items:
             self.inbox.put(item)
 
     def acknowledged_ranges(self) -> list[AcknowledgedRange]:
-        """All acknowledgements so far."""
         self.reported()
         return [acknowledged_range for report in self.port.reports for acknowledged_range in report.backlog]
 
@@ -360,7 +356,6 @@ def test_a_still_of_an_outage_is_called_as_the_box_that_it_names(confidence, wor
 
 
 def received(item: Received) -> ReceivedStill:
-    """A still as it is handed on."""
     return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
 
@@ -439,29 +434,6 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     assert f"uav-1-{sid:08x}".encode() in data, "the same recording to Rerun"
     content = completed(summary(rig.ended[0]), rig.receiver)
     assert content["backlog"]["recordings"] == [str(tmp_path / "backlog-0.rrd")]
-
-
-def test_a_full_disk_under_a_former_session_costs_no_more_than_time(flight, tmp_path):
-    """The ground would end, or acknowledge what it could not write: the edge would delete the only copy."""
-    former = Flight(45, keyframes=(20,))
-    with small_disk(tmp_path / "card") as card:
-        (card / "junk").write_bytes(bytes(1_040_384))
-        with Rig(tmp_path, flight) as rig:
-            rig.backlog_folder = card
-            rig.base(*range(10))
-            rig.facts(former)
-            assert rig.video(20, 45, of=former) not in rig.acknowledged_ranges()
-            rig.base(*range(10, 25))
-            assert rig.session.frames_decoded == 25, "the flight of now goes on"
-            eventually(lambda: rig.failures.parts)
-            (part,) = rig.failures.parts
-            assert not part.working
-            assert "No space left" in part.reason
-            (card / "junk").unlink()
-            # As the edge sends what is not acknowledged.
-            eventually(lambda: rig.video(20, 45, of=former) in rig.acknowledged_ranges())
-        shown = {frame for path in card.glob("backlog-*.rrd") for frame, _, _ in Recording(path).video()}
-        assert shown == set(range(20, 45))
 
 
 def test_no_more_files_are_made_than_the_bound(flight, tmp_path):

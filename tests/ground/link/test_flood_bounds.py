@@ -50,7 +50,6 @@ class Rig:
         return [one.text for one in self.events if isinstance(one, Notice)]
 
     def report(self, number: int, **changes) -> None:
-        """Take a report of the edge."""
         item = self.flight.status(base=3)
         status = Status.parse(item.payload)
         self.session.take(replace(status, sequence=number, **changes), item)

@@ -11,7 +11,6 @@ from rigs.flight import tracks_at
 
 
 def picture(value, *, height=4, width=6):
-    """A picture of one value."""
     return np.full((height, width, 3), value, np.uint8)
 
 

@@ -43,7 +43,6 @@ def flight() -> Flight:
 
 @pytest.fixture(scope="module")
 def pictures(flight) -> list[DecodedFrame]:
-    """As the decoder gives them."""
     decoder = BaseDecoder()
     return [
         DecodedFrame(unit.frame_index, unit.capture_ns, unit.capture_ns, decoder.decode(unit.data))
@@ -60,18 +59,15 @@ class Rig:
         self.pipeline: Pipeline = pipeline_of(self.events.append, reader=self.reader, **options)
 
     def look(self, pictures):
-        """Analyze them in turn."""
         for picture in pictures:
             self.pipeline.analyze(picture, hurry=False)
         return self
 
     def of(self, kind) -> list:
-        """Events of a kind."""
         return [one for one in self.events if isinstance(one, kind)]
 
 
 def received(flight: Flight, index: int, sequence: int, **changes) -> ReceivedStill:
-    """A still with its header parsed."""
     item = flight.still(index, sequence, **changes)
     return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
@@ -87,7 +83,6 @@ class Gated:
         self.seen: list[np.ndarray] = []
 
     def detect(self, image_bgr):
-        """Once it is let go."""
         self.seen.append(image_bgr)
         blind = self._blind_from is not None and len(self.seen) >= self._blind_from
         if self._taken is not None:

@@ -58,7 +58,6 @@ def picture(index: int, *, value: int) -> DecodedFrame:
 
 
 def opened(detector: Path, classifier: object, **more: Any) -> tuple[Models, list[Event], Pipeline]:
-    """Models of these files, and a pipeline with all that it emits."""
     settings = {"detector": str(detector), "classifier": str(classifier), "provider": "cpu", **more}
     config, events = check(GroundConfig(**settings)), list[Event]()
     models = Models(config)

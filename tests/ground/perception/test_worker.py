@@ -20,17 +20,14 @@ from rigs.flight import Flight, patient_worker
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """Real stills."""
     return Flight(3)
 
 
 def picture(index: int) -> DecodedFrame:
-    """A small one."""
     return DecodedFrame(index, index, index, np.zeros((8, 8, 3), np.uint8))
 
 
 def still(flight: Flight, index: int, sequence: int) -> ReceivedStill:
-    """Of that frame."""
     item = flight.still(index, sequence)
     return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
@@ -73,7 +70,6 @@ class Rig:
             assert self.begun.wait(timeout=60)
 
     def finish(self) -> list[tuple[str, Any]]:
-        """All that it did."""
         self.go_on.set()
         eventually(lambda: self.worker.idle, what="all is done")
         assert self.worker.close()

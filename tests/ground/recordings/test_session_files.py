@@ -59,7 +59,6 @@ def parts(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> list
 
 @pytest.fixture(scope="module")
 def whole(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """The same in one."""
     return Recording(rrd.recorded(tmp_path_factory.mktemp("whole") / "flight.rrd", events))
 
 

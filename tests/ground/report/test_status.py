@@ -20,7 +20,7 @@ from hvt_common.units import SECOND_NS
 from hvt_fleet.health import ground_status as watch
 from hvt_fleet.health.ground_metrics import metrics_text
 from hvt_ground.link import receiver
-from hvt_ground.report.state import GroundState, SessionState, StateMaker
+from hvt_ground.report.state import GroundState, PoseState, SessionState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -66,20 +66,17 @@ class Ground:
         return self.maker.make([("uav-1", self.sessions)])
 
     def line(self) -> str:
-        """The status line."""
         return status_text(self.state())
 
     def metrics(self) -> str:
         return metrics_text(self.state()).decode()
 
     def report(self, change: Callable[[Status], Status]) -> None:
-        """The edge reports."""
         item = self.port.flight.status(base=5)
         report = change(Status.parse(item.payload))
         self.sessions.handle(replace(item, payload=report.pack()))
 
     def end(self) -> dict[str, Any]:
-        """Its summary."""
         self.sessions.close()
         self.outputs.close()
         return summary(self.ended[0])
@@ -178,7 +175,11 @@ def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monke
     text = metrics_text(state).decode()
     assert 'hvt_view_trust_ratio{edge="uav-1"} 0.53' in text
     assert 'hvt_view_unlike{edge="uav-1"} 1.0' in text
-    said = json.dumps(replace(state, loading=True).as_dict()).encode()
+    (edge,) = state.edges
+    placed = replace(edge.session, pose=PoseState(48.1, 11.5, 120.0, age_s=0.4))
+    state = replace(state, loading=True, edges=(replace(edge, session=placed),))
+    assert 'hvt_pose_latitude_degrees{edge="uav-1"} 48.1' in metrics_text(state).decode()
+    said = json.dumps(state.as_dict()).encode()
     monkeypatch.setenv("COLUMNS", "300")
     monkeypatch.setattr(HTTPConnection, "request", lambda *_: None)
     answer = SimpleNamespace(status=200, read=lambda _most: said)
@@ -186,6 +187,7 @@ def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monke
     assert watch.run([]) == 0
     shown = capsys.readouterr().out
     assert "0 refined, UNKNOWN VIEW" in shown
+    assert "uav-1 is at 48.10000, 11.50000" in shown
     assert "detector loading" in shown
     content = ground.end()
     assert (content["view_trust"], content["view_unlike"]) == (0.53, True)

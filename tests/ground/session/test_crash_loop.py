@@ -78,7 +78,6 @@ def types_alive() -> Counter[str]:
 
 
 def name_of(kind: type) -> str:
-    """Its full name."""
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
@@ -105,7 +104,6 @@ class Restarted:
             query.reply("hvt/uav-1/info", self.flight.info().pack())
 
     def begin(self, number: int) -> None:
-        """The pictures of another session."""
         self.flight.session_id = 1_000_000 + number
         self._put(*(self.flight.base(index) for index in range(FRAMES)))
 
@@ -223,6 +221,5 @@ def stays(before: Held, between: Held, after: Held) -> None:
 
 
 def is_open(sessions: EdgeSessions, edge: Restarted) -> bool:
-    """Whether the edge's session has begun."""
     session = sessions.session
     return session is not None and session.info.session_id == edge.flight.session_id

@@ -53,7 +53,6 @@ class Consumer:
         return take
 
     def open(self, info: Info, reports: ReceiverReports) -> Session:
-        """A session with a recording."""
         self.tried += 1
         if self.broken == "opening":
             raise OSError(28, "No space left on device", "a.rrd")
@@ -124,7 +123,6 @@ class Unseen(Rig):
         self.second, self.began_ns = 0, time.time_ns()
 
     def report(self, *, sends: bool = True, state: str = "running") -> None:
-        """The next one, handled."""
         status = self.flight.status(base=15 * self.second * sends, roi=0, state=state)
         self.inbox.put(replace(status, received_ns=self.began_ns + self.second * SECOND_NS))
         self.second += 1
@@ -132,7 +130,6 @@ class Unseen(Rig):
 
     @property
     def said(self) -> str:
-        """The status line."""
         return status_text(StateMaker(time.time_ns).make([("uav-1", self.sessions)]))
 
 
@@ -258,7 +255,6 @@ class Held(RetryPause):
     over = False
 
     def due(self, now_ns: int) -> bool:
-        """See there."""
         return self.over or not self.pause_ns
 
 

@@ -48,7 +48,6 @@ class Rig(ReceiverRig):
         super().__init__(flight, pipeline=pipeline, **rest)
 
     def sinks_of(self, _info: Info) -> Sequence[Sink]:
-        """As they were given."""
         return self.sinks
 
     def take(self, *items: Received) -> None:
@@ -69,7 +68,6 @@ def flight() -> Flight:
 
 
 def bases(flight: Flight, *indices: int) -> list[Received]:
-    """Access units of frames."""
     return [flight.base(index) for index in indices]
 
 
@@ -82,20 +80,6 @@ def unthreaded(flight: Flight) -> tuple[Port, Clock, EdgeSessions]:
         return Session(info, pipeline_of=pipeline_of, clock=clock, reports=reports, worker_of=patient_worker)
 
     return port, clock, EdgeSessions(port, open_session=open_one, clock=clock)
-
-
-def test_a_unit_that_waited_behind_a_hole_is_reported_as_soon_as_it_is_given_out(flight):
-    """The edge would hold its next frames until it takes the link for lost."""
-    port, clock, sessions = unthreaded(flight)
-    for item in bases(flight, 0, 1, 2, 4):
-        clock.now_ns += 66_000_000
-        sessions.handle(replace(item, received_ns=clock.now_ns))
-    clock.now_ns += 150_000_000
-    sessions.housekeep(pending=False)
-    sessions.session.report()
-    last = port.reports[-1]
-    assert (last.base_sequence, last.base_held_us, last.lost) == (4, 150_000, 1)
-    sessions.close()
 
 
 def test_a_picture_that_the_link_lost_is_asked_for_at_once_and_shown_in_its_turn(flight):
@@ -462,19 +446,6 @@ def test_a_flight_goes_on_after_an_outage(flight):
         rig.take(*bases(flight, *range(10, 30)))
         assert rig.receiver.session is not None
         assert rig.session.frames_decoded == 10
-
-
-def test_slow_detection_never_holds_up_decoding(flight):
-    """With a large model the ground would fall behind the flight, more with every second."""
-    with Rig(flight, detector=RedSquares(takes_s=0.3)) as rig:
-        began = time.monotonic()
-        rig.put(*bases(flight, *range(30)))
-        eventually(lambda: rig.opened and rig.opened[0].frames_decoded == 30)
-        assert rig.opened[0].perceived.detections_run <= 2 + (time.monotonic() - began) / 0.3
-        rig.settle()
-    (session,) = rig.ended
-    assert session.reception.analyzed[0] == 29, "the newest is tracked, whatever is left out"
-    assert session.worker.untracked
 
 
 def test_what_the_detector_finds_after_the_last_picture_names_its_tracks(flight):

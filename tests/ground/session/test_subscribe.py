@@ -40,23 +40,19 @@ def ground_of(edges: str, port: int, **named) -> Iterator[tuple[GroundLink, zeno
 
 @pytest.fixture
 def link(free_port: int) -> Iterator[tuple[GroundLink, zenoh.Session]]:
-    """One that asks for all."""
     with ground_of("*", free_port) as both:
         yield both
 
 
 def say(outsider: zenoh.Session, edge: str, channel: str = "base") -> None:
-    """A message under that name."""
     outsider.put(f"hvt/{edge}/{channel}", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
 
 
 def show(outsider: zenoh.Session, *edges: str) -> list[zenoh.LivelinessToken]:
-    """The tokens of these names."""
     return [outsider.liveliness().declare_token(f"hvt/{edge}/alive") for edge in edges]
 
 
 def served(link: GroundLink) -> dict[str, EdgePort]:
-    """All ports by name."""
     return {port.edge: port for port in link.ports()}
 
 
@@ -203,7 +199,6 @@ class Declarations:
         self.threads: list[str] = []
 
     def declare_publisher(self, *arguments, **named):
-        """As the session does."""
         self.threads.append(threading.current_thread().name)
         return self._session.declare_publisher(*arguments, **named)
 
@@ -377,7 +372,6 @@ class Shared:
         self.elsewhere: set[str] = set()
 
     def serves(self, edge: str) -> bool:
-        """Whether it is this member's."""
         return edge not in self.elsewhere
 
     def release(self, edge: str) -> None:

@@ -277,7 +277,6 @@ def test_a_recording_does_not_mind_that_a_viewer_is_gone(samples, viewer, tmp_pa
 
 
 def feed(events: list[Event], *sinks: QueuedSink[Event]) -> None:
-    """Log them to all."""
     for event in events:
         for sink in sinks:
             sink.log(event)

@@ -52,7 +52,6 @@ class Graph:
         return name
 
     def columns(self, table: _Tensor, first: int, last: int) -> _Tensor:
-        """Columns of an (N, K) table."""
         return self.op("Slice", table, self.ints(first), self.ints(last), self.ints(1))
 
     def batch(self, tensor: _Tensor) -> _Tensor:

@@ -197,7 +197,6 @@ class Running:
         return time.monotonic() - began_s
 
     def kill(self) -> None:
-        """End it as ``kill -9`` does."""
         self.process.kill()
         self.process.wait(PATIENT_S)
 
@@ -259,7 +258,6 @@ class Link:
     def ground(
         self, *arguments: str, name: str = "ground", connects: bool = False, up: bool = True
     ) -> Running:
-        """Start a ground; with ``up`` return when it says where it listens."""
         where = ["--connect", self.edge_endpoint] if connects else ["--listen", self.ground_endpoint]
         running = self.start("hvt_ground.cli", [*where, *arguments], name=name)
         if up:

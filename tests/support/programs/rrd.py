@@ -121,7 +121,6 @@ class Recording:
         return [(f, ns, bytes(v[0])) for f, ns, v in self.rows("/base/video", "VideoStream:sample")]
 
     def events(self) -> list[tuple[int, str, str]]:
-        """(frame, level, text)."""
         texts = self.rows("/events", "TextLog:text")
         levels = self.rows("/events", "TextLog:level")
         return [(f, level[0], text[0]) for (f, _, text), (_, _, level) in zip(texts, levels, strict=True)]
@@ -139,7 +138,6 @@ class Recording:
         return sorted(found)
 
     def base_crops(self) -> list[tuple[int, bytes]]:
-        """(frame, picture) of every base crop."""
         return self._pictures("base")
 
     def boxes(self, frame: int) -> dict[int, ReadBox]:

@@ -39,7 +39,6 @@ def decision_step(frame_index: int = 300, **changes: Any) -> Step:
 
 
 def detections(boxes: Any, confidences: Any = 0.9, classes: Any = 0) -> Detections:
-    """What a detector finds in ``boxes``; a value is that of all, or one for each."""
     boxes = np.array(boxes, np.float32).reshape(-1, 4)
 
     def each(value: Any, kind: Any) -> npt.NDArray[Any]:
@@ -81,7 +80,6 @@ def tracks_of(
 
 
 def candidate(track_id: int = 1, box: tuple[float, ...] = (100, 100, 150, 140), **changes: Any) -> Candidate:
-    """Of a still: a car in ``box`` of a base picture of 1280x720, which the source shows as large."""
     area_px = (box[2] - box[0]) * (box[3] - box[1])
     fields: dict[str, Any] = {
         "frame_index": 300,
@@ -120,7 +118,6 @@ def refinement(**changes: Any) -> Refinement:
 
 
 def overlay(frame_index: int, boxes: Any, *, capture_ns: int = 0, **changes: Any) -> Overlay:
-    """The ground's tracks in ``boxes``: cars, numbered from 1, that no still has shown."""
     boxes = np.asarray(boxes, np.float32).reshape(-1, 4)
     count = len(boxes)
     fields: dict[str, Any] = {

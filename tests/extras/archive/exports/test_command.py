@@ -55,24 +55,20 @@ def events() -> list[Event]:
 
 @pytest.fixture(scope="module")
 def recording(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As the ground writes it."""
     return recorded(tmp_path_factory.mktemp("flight") / "flight.rrd", events)
 
 
 def export(recording: Path, out: Path, *words: str) -> Path:
-    """Run the command; it must be content."""
     assert hvt_ground.cli.main(["export", str(recording), *words, "--out", str(out)]) == 0
     assert [one.name for one in out.parent.iterdir() if one.name.endswith(".part")] == []
     return out
 
 
 def lines(table: Path) -> list[dict[str, str]]:
-    """Of a CSV file."""
     return list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """The one sentence."""
     assert hvt_ground.cli.main(["export", *map(str, words)]) == 2
     said = capsys.readouterr().err
     assert said.startswith("hvt-ground: "), said
@@ -81,7 +77,6 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
 
 
 def pictures(events: list[Event]) -> list[np.ndarray]:
-    """What the ground decoded."""
     decoder = BaseDecoder()
     return [decoder.decode(one.data) for one in events if isinstance(one, VideoSample)]
 

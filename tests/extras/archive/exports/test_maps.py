@@ -100,7 +100,6 @@ def bare(tmp_path_factory) -> Path:
 
 
 def export(recording: Path, out: Path) -> Path:
-    """Run the command; it must be content."""
     assert hvt_ground.cli.main(["export", str(recording), "--out", str(out)]) == 0
     return out
 

@@ -3,10 +3,6 @@
 import csv
 import errno
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +17,6 @@ from hvt_ground.events import MessageTiming, StillsRead
 
 
 def message(kind: str = "base", *, sequence: int, handled_ns: int | None = 3_000) -> MessageTiming:
-    """A message of frame 5."""
     return MessageTiming(kind, sequence, 5, 1_000, 1_500, 2_000, handled_ns, 5_100, -7)
 
 
@@ -112,29 +107,3 @@ def test_one_that_cannot_be_opened_again_leaves_no_files(tmp_path, monkeypatch):
     assert [one.name for one in tmp_path.iterdir()] == ["t.csv"]
     open_table().close()
     assert sorted(one.name for one in tmp_path.iterdir()) == ["t-2.csv", "t.csv"]
-
-
-WRITER = r"""
-import sys, time
-from pathlib import Path
-from hvt_archive.exports.tables import timing_table
-table = timing_table(Path(sys.argv[1]))
-for number in range(10**9):
-    table.log(f"base,{number}\n")
-    if number == 2000:
-        print("on", flush=True)
-"""
-
-
-def test_a_killed_ground_leaves_whole_lines(tmp_path):
-    """What led to the crash would be missing, or the last line cut."""
-    path = tmp_path / "t.csv"
-    with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as writer:
-        assert writer.stdout.readline() == b"on\n"
-        time.sleep(0.05)
-        writer.send_signal(signal.SIGKILL)
-    text = path.read_text()
-    assert text.endswith("\n")
-    numbers = [int(line.split(",")[1]) for line in text.splitlines()[1:]]
-    assert numbers == list(range(len(numbers)))
-    assert len(numbers) > 2000

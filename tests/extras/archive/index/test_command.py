@@ -31,7 +31,6 @@ def row(file: str, edge: str, begin_ns: int, classes: dict[str, int], **changes:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """With three recordings of two edges."""
     index = Index(tmp_path)
     index.put(row("b.rrd", "uav-1", NOON_NS, {"car": 12, "truck": 1}))
     index.put(row("a.rrd", "uav-1", NOON_NS + 86_400 * SECOND_NS, {"car": 3}, video=False))
@@ -42,7 +41,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def found(capsys: pytest.CaptureFixture[str], *words: object) -> list[str]:
-    """The files that the command prints."""
     assert hvt_ground.cli.main(["recordings", *map(str, words)]) == 0
     return [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]]
 

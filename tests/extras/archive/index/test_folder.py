@@ -29,13 +29,12 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.clock import boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import Limit
-from hvt_ground.events import Event, Overlay, Refinement, VideoSample
+from hvt_ground.events import Event, Overlay
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
-from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.sdk import viewer_program
-from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
+from media.recorded_feed import coded, drawn_frames, session
 from programs import rrd
 from programs.processes import eventually
 from programs.rrd import Recording, ends_its_reader
@@ -82,7 +81,6 @@ def log(sink: SessionFiles, events: list[Event], *, close: bool = True) -> None:
 
 
 def fly(folder: Path, events: list[Event]) -> Failures:
-    """Record them with an index, to the end."""
     with flying(folder) as (sink, failures):
         log(sink, events)
     return failures
@@ -90,7 +88,6 @@ def fly(folder: Path, events: list[Event]) -> Failures:
 
 @pytest.fixture(scope="module")
 def flown(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the two files and their index, to be copied."""
     folder = tmp_path_factory.mktemp("flown")
     fly(folder, events)
     return folder
@@ -98,7 +95,6 @@ def flown(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture
 def copied(flown: Path, tmp_path: Path) -> Path:
-    """Such a folder, for one test."""
     return copytree(flown, tmp_path / "flights")
 
 
@@ -123,20 +119,6 @@ def look(
         for _ in range(times - 1):
             writer.log(None)
     return read_index(folder)
-
-
-def test_it_says_what_is_in_each_file(tmp_path, events):
-    """The hour with the truck would be found by opening them all."""
-    failures = fly(tmp_path, events)
-    first, second = read_index(tmp_path)
-    assert [first.file, second.file] == NAMES
-    assert (first.edge, first.session, first.whole, first.video) == ("uav-1", "00ff", True, True)
-    assert (first.begin_ns, second.begin_ns) == (START_NS, START_NS + 30 * STEP_NS)
-    assert [one.size_bytes for one in (first, second)] == [(tmp_path / one).stat().st_size for one in NAMES]
-    assert first.classes["truck"] == 2
-    stills = {one.still_sequence for one in events if isinstance(one, Refinement)}
-    assert first.stills + second.stills == len(stills)
-    assert failures.parts == ()
 
 
 def test_files_tell_the_same_when_the_index_is_lost(copied):
@@ -348,12 +330,6 @@ def test_by_age_and_by_bytes(copied, caplog):
     assert list(copied.glob("*.rrd")) == []
 
 
-def test_by_age_one_goes_at_a_time(copied):
-    """Whatever went wrong with a clock, there would be nothing left to look at when it is noticed."""
-    day = Retention((Limit(seconds=86_400),))
-    assert [one.file for one in look(copied, day, later_s=90_000)] == NAMES[1:]
-
-
 CLOCKS = Retention((Limit(seconds=90 * 86_400.0),), Limit(seconds=14 * 86_400.0))
 YEAR_S = 365 * 86_400.0
 
@@ -560,19 +536,3 @@ def test_a_ground_killed_while_it_removes_video_leaves_no_half_file(copied):
     other.write_text("mine")
     assert [one.file for one in look(copied)] == NAMES
     assert [one.exists() for one in (half, empty, other)] == [False, False, True]
-
-
-def test_it_is_a_sink_of_the_house(tmp_path):
-    """It would be looked after by nobody."""
-    failures = Failures(time.time_ns)
-    sink = QueuedSink("recordings index", lambda: IndexWriter(tmp_path, ALL), failures=failures)
-    sink.log(RecordingRow("hvt-a.rrd", "a", "1", 1, 2, 3, 4, 5, 6, {"car\x1b": 7}))
-    assert sink.join(time.monotonic() + 60)
-    assert (sink.files, failures.parts) == ([], ())
-    assert [one.classes for one in read_index(tmp_path)] == [{"car\x1b": 7}]
-
-
-def test_samples_alone_make_a_row(tmp_path, events):
-    """A flight without anything in it would not be found at all."""
-    fly(tmp_path, [one for one in events if isinstance(one, VideoSample)])
-    assert [(one.frames, one.classes) for one in read_index(tmp_path)] == [(30, {}), (30, {})]

@@ -27,7 +27,6 @@ def row(days: float, *, video: bool = True, file: str | None = None) -> Recordin
 
 
 def names(*days: float) -> tuple[str, ...]:
-    """Of those files."""
     return tuple(map(name, days))
 
 

@@ -33,7 +33,6 @@ MESSAGES = [
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file with all of them."""
     path = tmp_path_factory.mktemp("log") / "flight.hvtlog"
     sink = MessageLog(path, most_bytes=MOST_BYTES)
     for one in MESSAGES:

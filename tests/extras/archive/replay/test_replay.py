@@ -42,7 +42,6 @@ NAMES = ("frame_index", "id", "x", "y", "w", "h", "class", "refined", "origin")
 
 
 def replay(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """Run the command; it must be content."""
     assert hvt_ground.cli.main(["replay", *map(str, words)]) == 0
     return capsys.readouterr().out
 
@@ -182,7 +181,6 @@ def test_what_cannot_be_is_said_in_one_sentence(drawn, tmp_path, capsys):
 
 
 def parsed(item: Received) -> object:
-    """The message, whichever it is."""
     _, channel = parse_key(item.key) or ("", None)
     match channel:
         case Channel.BASE:

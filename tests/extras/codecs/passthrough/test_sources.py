@@ -29,7 +29,6 @@ SETTINGS = SourceSettings(size=lambda size: size, fps=15)
 
 
 def coded(spec, *, size=None, **settings):
-    """Open it as ``--encoder passthrough`` does."""
     return Passthrough.open_source(str(spec), size=size or SETTINGS.size, fps=15, **settings)
 
 

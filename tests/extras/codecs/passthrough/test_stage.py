@@ -82,7 +82,6 @@ class Rig:
 
 
 def frames_of(folder: Path, pictures, **settings):
-    """A camera's frames, and its stream."""
     clip = write_clip(folder / "camera.mp4", pictures, **settings)
     with Passthrough.open_source(str(clip), size=SIZE, fps=15) as source:
         return list(source.frames(start_ns=START_NS))

@@ -1,12 +1,12 @@
 """Who watches a program: nobody else's page reads along."""
 
+import contextlib
 import errno
 import http.client
 import json
 import socket
 import threading
 import time
-from contextlib import contextmanager
 from http.server import HTTPServer
 from socketserver import ThreadingMixIn
 
@@ -68,7 +68,25 @@ def test_a_probe_may_ask_by_head():
         connection.request("HEAD", "/state.json")
         answer, length = connection.getresponse(), str(len(STATE.body))
         assert (answer.status, answer.headers["Content-Length"], answer.read()) == (200, length, b"")
+        connection.request("GET", "/../../etc/passwd")
+        assert connection.getresponse().status == 404
         connection.close()
+
+
+def test_connections_that_say_nothing_or_nonsense_hold_their_places_for_seconds_alone():
+    """A scanner of ports, or a stuck probe, would keep every other from a program that is well."""
+    with serving() as port, contextlib.ExitStack() as stack:
+        for number in range(40):
+            one = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+            with contextlib.suppress(OSError):  # it may be closed at once
+                one.sendall(b"\x00\xff" * 4000 if number % 2 else b"GET /me")
+
+        def serves() -> bool:
+            with contextlib.suppress(OSError, http.client.HTTPException):  # all places are taken
+                return asked(port, None) == 200
+            return False
+
+        eventually(serves, what="it serves on")
 
 
 def test_threads_and_descriptors_that_are_used_up_for_a_while(monkeypatch):
@@ -107,7 +125,7 @@ def test_what_is_no_address_is_told_the_one_that_status_asks(main, port, capsys)
         HealthServer("here", {}, failures=Failures(time.time_ns))
 
 
-@contextmanager
+@contextlib.contextmanager
 def serving(answer=STATE, *, at="127.0.0.1"):
     """The port of a program that answers so, once it does."""
     (port,) = free_ports(1)
@@ -117,8 +135,6 @@ def serving(answer=STATE, *, at="127.0.0.1"):
 
 
 def status(port, *words):
-    """``PROGRAM status`` of it."""
-
     def table(state):
         made = Table(title="uav-1")
         made.add_row(state["reason"])

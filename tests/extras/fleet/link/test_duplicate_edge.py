@@ -22,19 +22,16 @@ PATIENCE = 12.0
 
 @pytest.fixture(scope="module")
 def info() -> bytes:
-    """What an edge says of itself."""
     return Flight(1).info().pack()
 
 
 @pytest.fixture
 def endpoint(free_port: int) -> str:
-    """Of a ground."""
     return f"tcp/127.0.0.1:{free_port}"
 
 
 @pytest.fixture
 def ground(endpoint: str) -> Iterator[zenoh.Session]:
-    """Which listens there."""
     with open_session(LinkSettings("ground", listen=(endpoint,))) as session:
         yield session
 

@@ -42,7 +42,6 @@ def test_names_are_usable_as_keys():
 
 @pytest.fixture
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
-    """Two grounds on one link."""
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     with (
         open_session(LinkSettings("ground", (endpoint,), ())) as one,
@@ -56,7 +55,6 @@ def token(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
 
 
 def edge_of(member: str, *members: str) -> str:
-    """One that it serves among them."""
     return next(one for one in EDGES if owner_of(one, members) == member)
 
 

@@ -35,7 +35,6 @@ LAST = b"</event>"
 
 
 def message(uid: str, number: int = 0, *, size: int = 600) -> CotMessage:
-    """As long as an event is."""
     head = b'<event uid="%s" number="%d">' % (uid.encode(), number)
     return CotMessage(uid, head + b"." * (size - len(head) - len(LAST)) + LAST)
 
@@ -113,7 +112,6 @@ def fleet(tmp_path_factory) -> Fleet:
 
 
 def demanding(fleet: Fleet, name: str = "takserver") -> ssl.SSLContext:
-    """A server that wants a certificate of the client, as TAK Server does."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(fleet.folder / f"{name}.pem", fleet.folder / f"{name}.key")
     context.load_verify_locations(fleet.folder / "ca.pem")
@@ -122,7 +120,6 @@ def demanding(fleet: Fleet, name: str = "takserver") -> ssl.SSLContext:
 
 
 def keys(fleet: Fleet, **changes: str) -> dict[str, str]:
-    """The environment of a client."""
     said = {
         "PYTAK_TLS_CLIENT_CERT": str(fleet.folder / "client.pem"),
         "PYTAK_TLS_CLIENT_KEY": str(fleet.folder / "client.key"),

@@ -53,14 +53,12 @@ class Rig:
         )
 
     def log(self, item: CotMessage) -> None:
-        """As the sink of a connection."""
         self.sent.append(item)
 
     def close(self, hurry=None) -> None:
         """As above."""
 
     def says(self, item) -> list[ET.Element]:
-        """The events that follow from one of the session's."""
         before = len(self.sent)
         self.reporter.log(item)
         events = [ET.fromstring(one.data) for one in self.sent[before:]]
@@ -82,7 +80,6 @@ def overlay(capture_ns: int = 50 * SECOND_NS, *, ids=(1, 2), places=True, **chan
 
 
 def still(track_id: int | None, sequence: int = 3, **changes) -> Refinement:
-    """A still of a track."""
     values = {"frame_index": 7, "still_sequence": sequence, "track_id": track_id, "class_after": "truck"}
     return examples.refinement(**(values | changes))
 

@@ -15,7 +15,6 @@ STEP_NS = SECOND_NS // 15
 
 
 def tracks(frame: int) -> Overlay:
-    """Of a frame, none."""
     none = np.empty(0, np.int64)
     return Overlay(
         frame, frame * STEP_NS, none, np.empty((0, 4), np.float32), (), (), none.astype(np.float32), none > 0

@@ -70,7 +70,6 @@ def events() -> list[Event]:
 
 
 def written(path: Path, events: list[Event]) -> ReadStream:
-    """The file of these events, read back."""
     stream = stream_file(path, platform=PLATFORM, fps=15)
     for event in events:
         stream.log(event)
@@ -85,7 +84,6 @@ def units(data: bytes) -> list[bytes]:
 
 
 def samples_of(events: list[Event]) -> list[VideoSample]:
-    """The pictures."""
     return [one for one in events if isinstance(one, VideoSample)]
 
 

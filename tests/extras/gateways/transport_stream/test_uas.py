@@ -49,7 +49,6 @@ WITHOUT_POSE = {1, 2, 3, 10, 65}
 
 
 def said(pose: Pose | None, overlay: Overlay | None = None, *, view: View = VIEW) -> KlvPacket:
-    """One packet, read back."""
     platform = replace(PLATFORM, view=view)
     (found,) = packets_of(uas_local_set(platform, capture_ns=NOW_NS, pose=pose, overlay=overlay))
     return found

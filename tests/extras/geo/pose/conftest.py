@@ -21,26 +21,21 @@ class Autopilot:
         self._is_old = version == 1
 
     def say(self, kind: str, *values) -> bytes:
-        """Any message."""
         message = getattr(self._mav, f"{kind}_encode")(*values)
         return bytes(message.pack(self._mav, force_mavlink1=self._is_old))
 
     def heartbeat(self) -> bytes:
-        """It is there."""
         return self.say("heartbeat", 6, 8, 0, 0, 0)
 
     def place(self, latitude: float = 47.1, longitude: float = 8.5) -> bytes:
-        """Where it is."""
         at = (round(latitude * 1e7), round(longitude * 1e7))
         return self.say("global_position_int", 1000, *at, 550_000, 120_000, 0, 0, 0, 9000)
 
     def attitude(self, yaw_deg: float = 80.0) -> bytes:
-        """Where it flies."""
         turn = (math.radians(3), math.radians(-2), math.radians(yaw_deg))
         return self.say("attitude", 1000, *turn, 0, 0, 0)
 
     def fix(self, kind: int) -> bytes:
-        """What its receiver says."""
         return self.say("gps_raw_int", 0, kind, 0, 0, 0, *([65535] * 4), 0, 0, 0, 0)
 
     def mount(self) -> bytes:
@@ -52,7 +47,6 @@ class Autopilot:
         return self.say("mount_status", 0, 0, -4500, 0, 3000)
 
     def gimbal(self, yaw_deg: float, pitch_deg: float, *, flags: int) -> bytes:
-        """The same as a quaternion."""
         yaw, pitch = math.radians(yaw_deg) / 2, math.radians(pitch_deg) / 2
         q = (
             math.cos(yaw) * math.cos(pitch),
@@ -65,7 +59,6 @@ class Autopilot:
 
 @pytest.fixture
 def autopilot():
-    """Makes autopilots."""
     pytest.importorskip("pymavlink")
     return Autopilot
 
@@ -78,7 +71,6 @@ def now() -> list[float]:
 
 @pytest.fixture
 def source(port: int, now: list[float]) -> Iterator:
-    """What listens."""
     clock = lambda: round(now[0] * 1_000_000_000)  # noqa: E731
     opened = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=65.0, clock=clock)
     yield opened
@@ -87,7 +79,6 @@ def source(port: int, now: list[float]) -> Iterator:
 
 @pytest.fixture
 def port() -> int:
-    """Of UDP, a free one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         return int(one.getsockname()[1])
@@ -95,7 +86,6 @@ def port() -> int:
 
 @pytest.fixture
 def send(port: int) -> Iterator:
-    """Send datagrams to the port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
 
         def send(*datagrams: bytes) -> None:

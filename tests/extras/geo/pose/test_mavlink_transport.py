@@ -18,7 +18,6 @@ from hvt_geo.pose.mavlink_transport import MAX_FRAME_BYTES, Address, Connection,
 
 
 def opened(address: str):
-    """What listens."""
     return open_pose(f"mavlink:{address}", hfov_deg=None, clock=time.time_ns)
 
 

@@ -22,7 +22,6 @@ BOXES = {"A": A, "B": B, "C": C}
 
 
 def moved(box, dx, dy=0.0):
-    """A box elsewhere."""
     return (box[0] + dx, box[1] + dy, box[2] + dx, box[3] + dy)
 
 
@@ -41,13 +40,11 @@ class Ground:
         self.fusion = Fusion(fps=15, edge_classes=places, path=self.path, **options)
 
     def own(self, index, boxes, **more):
-        """A frame of ours."""
         tracks = tracks_at(index, boxes, **more)
         self.fusion.take_own(tracks)
         return self.fusion.listed(tracks)
 
     def step(self, index, boxes, **more):
-        """A step of the edge."""
         self.fusion.take_step(tracks_at(index, boxes, **more), own=self.fusion.own_at(index))
 
     def found(self, index, *boxes):
@@ -68,19 +65,16 @@ class Ground:
 
 
 def brief(fused):
-    """Origin and box of each id, whole pixels."""
     rows = zip(fused.tracks.ids.tolist(), fused.origins, fused.tracks.boxes_xyxy_px, strict=True)
     return {i: (origin, tuple(np.rint(box).astype(int).tolist())) for i, origin, box in rows}
 
 
 def whole(box):
-    """Of a box in this file."""
     return tuple(round(side) for side in box)
 
 
 @pytest.fixture
 def ground():
-    """Nothing known yet."""
     return Ground()
 
 

@@ -44,7 +44,6 @@ class Bright:
     class_names = ("car", "bus", "van")
 
     def detect(self, image_bgr: Image) -> Detections:
-        """Boxes of coloured areas."""
         boxes, classes = [], []
         for class_id, channel in ((0, 2), (1, 1)):
             others = [one for one in range(3) if one != channel]
@@ -88,7 +87,6 @@ class Says:
         self.seen: list[Image] = []
 
     def detect(self, image_bgr: Image) -> Detections:
-        """The rows, each a box, a confidence and a class."""
         self.seen.append(image_bgr)
         boxes, confidences, classes = zip(*self.rows, strict=True) if self.rows else ((), (), ())
         return detections(boxes, confidences, classes)
@@ -196,7 +194,6 @@ def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch
 
 @pytest.fixture
 def reader(tmp_path) -> CropReader:
-    """Of colours."""
     names = tmp_path / "names.txt"
     names.write_text("red\ngreen\nblue\n")
     model = colour_classifier(tmp_path / "colour.onnx")

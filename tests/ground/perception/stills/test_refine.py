@@ -33,7 +33,6 @@ BOXES = {
 
 
 def tracks(frame_index, boxes, *, born=None, classes=None, confidences=None):
-    """Tracks at a frame from ``{id: box}``; all cars at 0.5 that were born at frame 0 unless said."""
     listed = {"born": born or {}, "classes": classes or {}, "confidences": confidences or {}}
     plain = {"born": 0, "classes": 0, "confidences": 0.5}
     values = {name: [of.get(one, plain[name]) for one in sorted(boxes)] for name, of in listed.items()}
@@ -56,7 +55,6 @@ CAR = says(0.05, 0.9, 0.05)
 def still(
     sequence, frame_index, box=A, *, edge=70, posterior=VAN, class_name="car", words=WORDS, side_px=20.0
 ):
-    """A still of an edge track."""
     posterior = words.vote(posterior, called=class_name, side_px=20.0)[0]
     return seen(sequence, frame_index, posterior, box, edge=edge, class_name=class_name, side_px=side_px)
 
@@ -77,16 +75,13 @@ class Ground:
         return self.settle()
 
     def settle(self):
-        """What is settled now."""
         return self.refiner.settle(self.history, now_frame=self.now)
 
     def offer(self, *stills):
-        """Offer stills and settle."""
         out = [done for one in stills for done in self.refiner.offer(one, now_frame=self.now)]
         return out + self.settle()
 
     def run(self, start, stop, boxes):
-        """Track the same boxes from one frame to before another."""
         return [done for frame_index in range(start, stop) for done in self.track(frame_index, boxes)]
 
     def told(self, story):
@@ -117,7 +112,6 @@ class Ground:
 
 
 def brief(resolved):
-    """(sequence, outcome, track) of each."""
     return [(done.event.still_sequence, done.outcome, done.event.track_id) for done in resolved]
 
 

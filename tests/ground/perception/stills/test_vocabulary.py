@@ -127,7 +127,6 @@ def flown(words, *posteriors, **how):
 
 
 def told(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, mode="fuse", aslant=False):
-    """The same, and the events of the stills."""
     tracks = tracks_of(0, [(10, 10, 50, 40)], confidences=confidence, classes=base)
     history = History(track_frames=10)
     history.add_tracks(tracks)

@@ -28,7 +28,6 @@ def areas(labels, size=SIZE):
 
 
 def overlap(a, b) -> bool:
-    """Whether two areas share more than an edge."""
     return bool((np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]) > 1e-6).all())
 
 

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import socket
 import subprocess
 import threading
 from collections.abc import Iterable
@@ -15,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_archive.viewer import LiveView, free_port, viewer_program
+from hvt_archive.viewer import viewer_program
 from hvt_common.errors import UserError
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.palette import class_colour
@@ -40,7 +39,6 @@ def units() -> list[tuple[bytes, bool]]:
 
 @pytest.fixture(scope="module")
 def events(units: list[tuple[bytes, bool]]) -> list[Event]:
-    """A session made of them."""
     return [event for event, _ in session(drawn_frames(FRAMES), units, tracks=TRACKS, total_kbps=500)]
 
 
@@ -50,7 +48,6 @@ def of(kind: type, events: list[Event]) -> list:
 
 @pytest.fixture(scope="module")
 def recording(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """The session, recorded and read back."""
     return Recording(recorded(tmp_path_factory.mktemp("rrd") / "flight.rrd", events))
 
 
@@ -359,16 +356,6 @@ def _carpark(data: Path, count: int) -> list[np.ndarray]:
             if len(frames) == count:
                 break
     return frames
-
-
-def test_a_taken_port_is_one_sentence() -> None:
-    """Two grounds on one machine: the second must say why it cannot show."""
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(UserError, match=f"port {port}"):
-            LiveView("serve", port=port, web_port=free_port())
 
 
 def overlay(frame: int, boxes: np.ndarray, *, refined: bool = False, confidence: float = 0.8) -> Overlay:
