@@ -38,7 +38,8 @@ from hvt_study.datasets.annotation_rows import label_text
 from hvt_study.datasets.labels import FrameLabels, LabelDoubts
 
 LOOKED_IN = (
-    "labels/, annotations/, Annotations/, beside the pictures, and COCO's JSON in annotations/ and beside"
+    "labels/, annotations/, Annotations/, beside the pictures, and COCO's JSON in annotations/ and beside, but for "
+    "captions_…, panoptic_… and stuff_…"
 )
 YAML = (".yaml", ".yml")
 _PICTURES = ("images", "JPEGImages", "data", "obj_train_data")
@@ -66,6 +67,7 @@ _TABLES, _PACKED = (".csv", ".tsv", ".txt"), ".tfrecord"
 _NUMBER = rb"(?:[-+]?[\d.]{1,30}(?:e[-+]?\d{1,3})?|nan)"
 _BOX = re.compile(rb"(?im)^(?:%b[ \t,;]+){3}%b[ \t,;\r]*$" % (_NUMBER, _NUMBER))
 """A line of four numbers and nothing else."""
+_PART = re.compile(r"_\d+$")
 _WORDS, _IS_NUMBER = re.compile(rb"[\s,;:\"'/\\]+"), re.compile(_NUMBER, re.IGNORECASE)
 _POSES = re.compile(rb"^.*(?:gps|geo|pose)|\blat(?:itude)?(?:\b|_)|epsg", re.IGNORECASE)
 """In the name or, below it, the head of a table of places."""
@@ -74,6 +76,8 @@ _CLASSES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml")
 _COCO = ("labels.json", "result.json", "annotations.json", "_annotations.coco.json", "coco.json")
 _COCO_BOXES = "instances_"
 """COCO's own name for the file with boxes, beside captions and keypoints of the same pictures; CVAT's too."""
+_NO_OBJECTS = ("captions_", "panoptic_", "stuff_")
+"""How names of COCO's files of sentences, and of skies and lawns, begin."""
 _NO_LABELS = ("captions_", "person_keypoints_", "detections.csv")
 """How names of COCO's other files begin, and the name of what ``hvt-study detect`` writes."""
 _DEPTH = 3
@@ -171,7 +175,7 @@ def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) ->
     beside = [one for home in homes for one in home.parent.glob(f"{escape(home.name)}[._]*")]
     files = (one for folder in folders for one in sorted(folder.iterdir()))
     names, sizes = {os.fsencode(one.name) for one in pictures}, {len(pictures), *homes.values()}
-    stems = set() if known else {one.stem for one in pictures}
+    stems, parts = set() if known else {one.stem for one in pictures}, {home.name for home in homes}
     kinds = {(path.parent, path.suffix) for path in known}
     unread = []
     for path in islice((one for one in (*files, *beside) if _may_hold_labels(one, known)), _LOOKED_INTO):
@@ -190,7 +194,9 @@ def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) ->
                 os.fsencode(f"{path.name}\n") + start.partition(b"\n")[0]
             ):
                 rows = len(_BOX.findall(listed))
-                if (rows > 1 and rows in sizes) or _has_boxes(start, names, alike=alike):
+                # UAV123 has a list, and one for each part, of a folder of that name.
+                of_folder = _PART.sub("", path.stem) in parts
+                if (rows > 1 and (rows in sizes or of_folder)) or _has_boxes(start, names, alike=alike):
                     unread.append(path)
     if sure and not known:
         path, what = next(iter(sure.items()))
@@ -252,6 +258,7 @@ def coco_files(place: Path) -> list[Path]:
     folders = _open_folders(place, 1)
     found = [folder / name for folder in folders for name in _COCO if (folder / name).is_file()]
     files = sorted((place / "annotations").glob("[!.]*.json"))
+    files = [one for one in files if not one.name.startswith(_NO_OBJECTS)]
     found += [one for one in files if one.name.startswith(_COCO_BOXES)] or files
     return found or [one for one in sorted(place.glob("[!.]*.json")) if _is_coco(one)]
 

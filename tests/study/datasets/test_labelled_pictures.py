@@ -347,6 +347,10 @@ REFUSED = [
     ({"train.jsonl": '{"image": "a.jpg", "bbox": [1, 2, 3, 4]}'}, UNREAD),
     ({"vott.json": '{"regions": [{"boundingBox": {}}]}'}, UNREAD),
     ({"via.json": '{"a.jpg1": {"regions": [{"shape_attributes": {}}]}}'}, UNREAD),
+    (
+        {"annotations/stuff_a.json": coco(), "annotations/panoptic_a.json": "{}"},
+        "but for captions_…, panoptic",
+    ),
     ({"images/a.xml": "<kml/>"}, r"a\.xml is not an XML of Pascal VOC \(its root is kml"),
     # Of labels in pixels nothing is right; of classes from 1, each would be the next one, and the last left out.
     (
@@ -405,6 +409,7 @@ def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
     "files",
     [
         {"anno/bike1.txt": "NaN,NaN,NaN,NaN\n20,10,60,50\n"},  # UAV123
+        {"anno/img_2.txt": "20,10,60,50\n" * 5},
         {"img/groundtruth_rect.2.txt": "20\t10\t60\t50\n" * 2},  # OTB, of two targets
         {"export/a.ndjson": '{"external_id": "a.jpg", "projects": {"annotations": {"objects": []}}}'},
         {"gt/a.txt": ROW},
