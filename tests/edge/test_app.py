@@ -173,9 +173,7 @@ def test_a_flight_that_breaks_off_is_reported_all_the_same(tmp_path, caplog):
     with pytest.raises(FlightError, match="it is torn"):
         reported(edge(tmp_path, world, pace="lockstep").run, told.append)
     (summary,), last = told, world.reports[-1]
-    assert (last.state, [one.reason for one in last.failed]) == ("ended", ["it is torn"]), (
-        "the ground is told"
-    )
+    assert (last.state, [one.reason for one in last.failed]) == ("ended", ["it is torn"]), "the ground hears"
     assert summary["frames"] == 6
     assert [(one["part"], one["reason"]) for one in summary["failed"]] == [("flight", "it is torn")]
     assert "all else goes on" not in caplog.text

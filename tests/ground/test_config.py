@@ -67,8 +67,7 @@ def test_every_flag_explains_itself(capsys):
 
 
 @pytest.mark.parametrize(
-    ("option", "file"),
-    [("record", "a.rrd"), ("tracks", "a.csv"), ("stills", "a.csv"), ("mcap", "a.mcap")],
+    ("option", "file"), [("record", "a.rrd"), ("tracks", "a.csv"), ("stills", "a.csv"), ("mcap", "a.mcap")]
 )
 def test_a_folder_that_is_not_there_is_made_and_a_file_of_another_kind_refused(tmp_path, option, file):
     """All tracks of a flight would be lost."""

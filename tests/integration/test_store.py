@@ -97,9 +97,7 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     shown = frames_shown(tmp_path.glob("run*.rrd"))
     first_ns = min(shown.values())
     came = sorted(round((ns - first_ns) / 1e6) for ns in shown.values())
-    assert came == times_in(tmp_path / "own.mkv"), (
-        "each frame that was coded is in the recording, at its time"
-    )
+    assert came == times_in(tmp_path / "own.mkv"), "each coded frame is in the recording, at its time"
     live, past = stills_taken(tmp_path / "timing.csv")
     # How many of them were chosen in the dark depends on how busy the machine is: the next test has a full store.
     assert live | past == admitted(sent) != set(), "each still that was admitted, by its number"

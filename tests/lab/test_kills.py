@@ -61,9 +61,7 @@ def test_a_store_is_read_as_the_next_start_would(tmp_path):
     with Store(tmp_path / "store", max_bytes=10**8, session_id=7, info=lambda: info) as store:
         for unit in units:
             store.add_unit(unit)
-    assert store_left(tmp_path / "none") == StoreLeft(0, 0, 0.0), (
-        "a flight without an outage counts against nobody"
-    )
+    assert store_left(tmp_path / "none") == StoreLeft(0, 0, 0.0), "a flight without one counts against nobody"
     whole = store_left(tmp_path / "store")
     assert (whole.objects, whole.unreadable, whole.missing_s) == (1, 0, 0)
 

@@ -46,8 +46,7 @@ def picture(*boxes, size=(1280, 720), value=255):
 
 
 @pytest.mark.parametrize(
-    ("size", "grid"),
-    [((1280, 720), (2, 2)), ((1921, 1083), (5, 3)), ((100, 80), (1, 4)), ((64, 64), (1, 1))],
+    ("size", "grid"), [((1280, 720), (2, 2)), ((1921, 1083), (5, 3)), ((100, 80), (1, 4)), ((64, 64), (1, 1))]
 )
 def test_tiles_cover_the_picture_and_overlap(size, grid):
     """An object in a gap would never be seen, or one on a border never whole."""

@@ -36,10 +36,7 @@ def test_a_key_parses_back(edge, row):
             *(EdgeKeys, "a-z, 0-9 and '-' are accepted"),
             ["", "UAV-1", "uav_1", "a/b", "a" * 33, "uav 1", "*", "uäv", "uav-1\n"],
         ),
-        (
-            *(check_edge_pattern, "'\\*' for any run"),
-            ["", "uav?", "a/b", "[a-z]", "UAV-*", "$*", "a" * 65],
-        ),
+        (*(check_edge_pattern, "'\\*' for any run"), ["", "uav?", "a/b", "[a-z]", "UAV-*", "$*", "a" * 65]),
     ],
 )
 def test_an_edge_id_or_pattern_outside_the_alphabet_is_one_sentence(take, says, wrong):

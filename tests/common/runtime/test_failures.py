@@ -65,9 +65,7 @@ def test_pauses_grow_to_their_limit_and_begin_anew_after_a_steady_time():
     assert pauses == [1, 2, 4, 8, 8, 8]
     for worked_s, then_s in ((9, 8), (11, 1), (11, 1), (9, 2)):
         pause.failed(now_ns := now_ns + worked_s * SECOND_NS)
-        assert pause.pause_ns == then_s * SECOND_NS, (
-            "a camera that drops each 11 s would be dark for 8 of them"
-        )
+        assert pause.pause_ns == then_s * SECOND_NS, "a camera that drops each 11 s would be dark for 8"
         now_ns += pause.pause_ns
 
 

@@ -39,9 +39,7 @@ def test_who_reports_nearly_all_is_believed_against_the_weak():
     assert recall.share(CAR) == pytest.approx(0.9, abs=0.01)
     assert recall.least_confidence(CAR) == pytest.approx(0.8, abs=0.02)
     assert heard((60, 60)).least_confidence(CAR) > 0.8, "a crowd tells at once"
-    assert heard(*[(600, 600)] * 60).least_confidence(CAR) < 0.82, (
-        "but nobody sees all of what is hard to see"
-    )
+    assert heard(*[(600, 600)] * 60).least_confidence(CAR) < 0.82, "nobody sees all of what is hard to see"
 
 
 def test_who_reports_each_car_may_know_no_people():

@@ -183,9 +183,7 @@ def test_what_may_be_sent_now_and_how_much(tmp_path, monkeypatch):
     rig.outbox.offer(pending)
     sent = _fill(rig, first=0)
     rig.outbox.give_up(pending)
-    assert rig.backlog.chunk_allowance(rig.now_ns) != 1400, (
-        "all that stills have was kept for the pending one"
-    )
+    assert rig.backlog.chunk_allowance(rig.now_ns) != 1400, "all that stills have is kept for the pending one"
     _fill(rig, first=sent)
     assert rig.backlog.chunk_allowance(rig.now_ns) == 1400, (
         "a third of the stills' share stays free, but for the backlog's own"
@@ -257,9 +255,7 @@ def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
     rig.report()
     rig.play(60, 62)
     assert not rig.backlog.offline
-    assert rig.sender.budget.total_bps == rig.pacer.rate_bps < 800_000, (
-        "the link has to show first what it carries"
-    )
+    assert rig.sender.budget.total_bps == rig.pacer.rate_bps < 800_000, "first the link shows what it carries"
     rig.backlog.close()
 
 

@@ -33,9 +33,7 @@ def test_a_box_of_three_seconds_ago_is_cut_from_the_frame_of_then():
     assert header.parameters == {"ask": answer.still_request}
     assert (header.frame_index, header.crop_source_px, header.track_id) == (14, (300, 200, 396, 264), -1)
     truth = picture(14)[200:264, 300:396]
-    assert cv2.PSNR(shown(header, data), truth) > 25, (
-        "the picture's noise is coloured, and colour is kept at half size"
-    )
+    assert cv2.PSNR(shown(header, data), truth) > 25, "its noise is coloured, and colour is kept at half size"
     other = picture(59)[200:264, 300:396]
     assert cv2.PSNR(shown(header, data), other) < 20
 

@@ -207,9 +207,7 @@ def test_from_every_state_live_video_is_back_within_three_seconds(seeds, loses):
         slow = max(1.0, needed_bps(flight.config, 1.0) / flight.config.budget_bps)
         for second in back:
             held = max(second, flight.drained(second))  # what waited in the link comes first
-            assert flight.back_after(second) <= held - second + slow * BACK_S, (
-                f"seed {seed}, away until {second}"
-            )
+            assert flight.back_after(second) <= held - second + slow * BACK_S, f"seed {seed}, to {second}"
 
 
 @pytest.mark.parametrize(("late_s", "share"), [(0.6, 1.0), (1.5, 1.0), (0.0, 0.4)])

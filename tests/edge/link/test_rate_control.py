@@ -12,12 +12,7 @@ from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.link.feedback import PrimaryReceiver
 from hvt_edge.link.pacer import Flight, Pacer
-from hvt_edge.link.rate_control import (
-    LeastDelay,
-    Progress,
-    RateController,
-    ReconfigurationTrigger,
-)
+from hvt_edge.link.rate_control import LeastDelay, Progress, RateController, ReconfigurationTrigger
 from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.wiring.link import make_pacer
 from rigs.live_flight import LiveFlight, SteppedLink

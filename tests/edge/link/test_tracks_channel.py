@@ -52,9 +52,7 @@ def test_each_decision_step_is_told_and_nothing_else():
     steps = told([seen(index, detected=index % 5 == 0, coded=index % 2 == 0) for index in range(31)])
     assert [step.frame_index for step in steps] == [0, 5, 10, 15, 20, 25, 30]
     assert [step.sequence for step in steps] == list(range(7))
-    assert {(step.session_id, step.send_delay_ns) for step in steps} == {(77, 45_000_000)}, (
-        "the budget's time"
-    )
+    assert {(step.session_id, step.send_delay_ns) for step in steps} == {(77, 45_000_000)}, "the budget's"
     assert [step.reference for step in steps] == [-1, 0, 1, -1, 3, 4, -1]
     decoder = TrackStepDecoder()
     for step in steps:

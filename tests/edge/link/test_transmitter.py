@@ -139,9 +139,7 @@ def test_repetitions_keep_to_the_budget_and_to_a_share_of_it():
     assert rig.ledger.worst_window_bps.total <= 200_000
     assert rig.sender.base(unit(20), now_ns=now_ns)
     assert rig.ledger.worst_window_bps.total <= 200_000
-    assert [one.sequence for one in again] == list(range(4, 4 + len(again))), (
-        "no frame without those before it"
-    )
+    assert [one.sequence for one in again] == list(range(4, 4 + len(again))), "none without those before it"
     later_ns = now_ns + 2 * SECOND_NS
     rig.sender.resend((14,), now_ns=later_ns - SECOND_NS)
     assert len(rig.out.base) > 16, "what had no room may go at the next report"
@@ -155,10 +153,7 @@ def test_a_base_message_says_what_the_ground_needs():
     told = [
         (one.session_id, one.sequence, one.frame_index, one.capture_ns, one.send_ns) for one in rig.out.base
     ]
-    assert told == [
-        (2**32 - 1, 0, 4, NOW_NS + 4, NOW_NS + 100),
-        (2**32 - 1, 1, 7, NOW_NS + 7, NOW_NS + 200),
-    ]
+    assert told == [(2**32 - 1, 0, 4, NOW_NS + 4, NOW_NS + 100), (2**32 - 1, 1, 7, NOW_NS + 7, NOW_NS + 200)]
     assert [one.flags for one in rig.out.base] == [Flags.KEYFRAME | Flags.PARAMETER_SETS, 0]
     assert [encoding for *_, encoding in rig.out.puts] == ["video/h265"] * 2
     assert rig.sender.base_sequence == 1
@@ -288,9 +283,7 @@ def test_what_is_no_frame_waits_for_nothing_and_leaves_the_next_frame_its_room(c
     assert not send(NOW_NS + 100)
     assert not send(NOW_NS + SECOND_NS // 2)
     assert rig.waits == [NOW_NS]
-    assert rig.budget.earliest_ns(500, now_ns=NOW_NS + 100) == NOW_NS + 100, (
-        "a frame that fits goes before it"
-    )
+    assert rig.budget.earliest_ns(500, now_ns=NOW_NS + 100) == NOW_NS + 100, "a frame that fits goes before"
     assert send(NOW_NS + SECOND_NS + 1)
     assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS + 1]
     row, _, attachment, encoding = rig.out.puts[-1]

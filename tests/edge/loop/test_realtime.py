@@ -184,9 +184,7 @@ def test_a_clip_that_cannot_be_read_in_real_time_is_played_slower(reading_s):
     assert all(new > old for old, new in pairwise(captures))
     shown_at = [one.capture_ns + one.send_delay_ns for one in out.headers]
     most_s = 0.25 + reading_s
-    assert max(new - old for old, new in pairwise(shown_at)) / SECOND_NS <= most_s + 1e-6, (
-        "none is left out for long"
-    )
+    assert max(new - old for old, new in pairwise(shown_at)) / SECOND_NS <= most_s + 1e-6, "none is away long"
 
 
 def test_a_clip_that_waits_for_its_file_to_grow_blames_no_machine():

@@ -39,9 +39,7 @@ class Rig:
         self.at_s += seconds
         self.control.decide(self.at_s * SECOND_NS)
         says = self.operating.now.decisions.says
-        assert {one for one, _ in each_decision(says)} <= DECISION_WORDS.keys(), (
-            "the page has a sentence for each"
-        )
+        assert {one for one, _ in each_decision(says)} <= DECISION_WORDS.keys(), "the page has words for each"
         return self.operating.now.decisions
 
 

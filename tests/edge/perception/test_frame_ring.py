@@ -103,9 +103,7 @@ def test_now_is_the_newest_frame_from_the_camera_and_a_track_is_where_it_was_ana
     assert ring.newest() is None
     filled(ring, 10)
     ring.capture(frame(12))
-    assert frame_for(OnDemandRequest(), ring).frame_index == 9, (
-        "the analyzed frame is near: there is a base to beat"
-    )
+    assert frame_for(OnDemandRequest(), ring).frame_index == 9, "the analyzed one is near: a base to beat"
     ring.capture(frame(60))
     for asked, index in (
         ({}, 60),

@@ -73,9 +73,7 @@ def test_what_the_base_shows_in_error_counts():
     shadow = compared(base, confidences=objects).now
     recall = min(0.9, (18 + 10 * 18 / (19 + 2)) / (19 + 10))  # see `Recall`
     weak, strong = (c * (1 - recall) / (c * (1 - recall) + 1 - c) for c in (0.5, 0.95))
-    assert (shadow.hidden, shadow.false, shadow.suppressed) == (0, 5, 4), (
-        "one is surer than the source is silent"
-    )
+    assert (shadow.hidden, shadow.false, shadow.suppressed) == (0, 5, 4), "one is surer, the source silent"
     true = 18 * 0.9 + 4 * weak + strong
     for share, gain in ((1, shadow.gain), (1 - 1 / 4**0.5, shadow.sure_gain)):
         base_f1 = 2 * true / (23 + true)
@@ -146,9 +144,7 @@ def test_a_count_that_differs_by_chance_changes_nothing():
         assert shadow.measured.sure_gain == shadow.now.sure_gain
         assert shadow.measured.gain < 0.1
     ghosts = reporting(4, 0, objects={})
-    assert (ghosts.now.false, ghosts.measured.gain) == (pytest.approx(4), 0), (
-        "who shows nothing shows no error"
-    )
+    assert (ghosts.now.false, ghosts.measured.gain) == (pytest.approx(4), 0), "who shows none shows no error"
     silent = compared(found(0), confidences=TWENTY)
     assert silent.measured == replace(silent.now.measured, moved=silent.measured.moved), "it has not reported"
 

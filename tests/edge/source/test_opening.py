@@ -92,9 +92,7 @@ def test_a_real_clip_shows_the_right_frames_without_distortion(data):
     with open_source(clip, size=(1280, 720), fps=15, max_frames=25) as source:
         for frame in source.frames(start_ns=0):
             assert np.array_equal(frame.source_bgr, decoded[frame.index * 24 // 15])
-            assert np.array_equal(frame.base_bgr[:, 90:1190], frame.source_bgr), (
-                "1100x720 between two borders"
-            )
+            assert np.array_equal(frame.base_bgr[:, 90:1190], frame.source_bgr), "1100x720 between borders"
             assert not frame.base_bgr[:, :90].any()
             assert not frame.base_bgr[:, 1190:].any()
 

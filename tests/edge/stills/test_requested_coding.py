@@ -197,9 +197,7 @@ def test_in_flight_it_is_full_prompt_and_better_than_the_video_with_every_method
             continue
         assert look.delay_s <= bound_s
         if said := re.search(r"within about ([\d.]+) s", look.note):
-            assert look.delay_s + 8 * look.size_bytes / budget_bps <= float(said[1]) + 0.2, (
-                "it is said in advance"
-            )
+            assert look.delay_s + 8 * look.size_bytes / budget_bps <= float(said[1]) + 0.2, "said in advance"
         assert look.image.shape[:2] == (height, width) or look.note
         image = cv2.resize(look.image, (width, height), interpolation=cv2.INTER_CUBIC)
         assert psnr_y_db(image, look.source) > psnr_y_db(look.base, look.source)

@@ -6,12 +6,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder import (
-    EncoderSettings,
-    check_encoder,
-    encoder_names,
-    open_encoder,
-)
+from hvt_edge.video.encoder import EncoderSettings, check_encoder, encoder_names, open_encoder
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
 from media.third_party import ENCODERS

@@ -190,9 +190,7 @@ def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     """A tenth of a thin link would lie idle until the next scheduled keyframe, up to a minute later."""
     operating = Operating(budget_bps=300_000, video_share=None, base_bps=255_000, method="M6", decimation=2)
     reconfiguration = reconfiguration_of(
-        operating,
-        split(300_000, metadata_bps=8_000),
-        lambda _rates: pytest.fail("only a keyframe opens it"),
+        operating, split(300_000, metadata_bps=8_000), lambda _rates: pytest.fail("only a keyframe opens it")
     )
     for number in range(60):
         reconfiguration.split.observe(crowd(8), moment(number / 3, from_source=True))

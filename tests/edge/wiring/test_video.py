@@ -73,10 +73,7 @@ def test_no_refusal_says_the_cameras_password(tmp_path: Path, opens, says):
     """It would stand in a log that everybody reads."""
     config = EdgeConfig(source="rtsp://admin:SECRET@10.0.0.5/s", encoder="passthrough", fps=5.0)
     clip = write_clip(tmp_path / "a.mp4")
-    with (
-        opens(str(clip), size=SIZE, fps=15) as source,
-        pytest.raises(UserError, match=says) as caught,
-    ):
+    with opens(str(clip), size=SIZE, fps=15) as source, pytest.raises(UserError, match=says) as caught:
         surveyed(config, source)
     assert "SECRET" not in str(caught.value)
     assert "10.0.0.5" in str(caught.value)

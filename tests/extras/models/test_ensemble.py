@@ -96,9 +96,7 @@ def test_where_one_part_fails_the_others_go_on(caplog: pytest.LogCaptureFixture)
     assert "detector 2: RuntimeError: device lost; all else goes on" in caplog.text
     neither = opened(lambda _part, _: Fails(STREET))
     assert neither.detect(PICTURE) is None, "that nothing is there is not known"
-    assert "detector" in {one.part for one in failures.now}, (
-        "a ground would not hear that nothing is detected"
-    )
+    assert "detector" in {one.part for one in failures.now}, "a ground would not hear that none is detected"
     config: Any = SimpleNamespace(detector="aerial-nano", candidates="decoded")
     view: Any = SimpleNamespace(base_size=(64, 64), source_size=(64, 64), enlarges=False)
     warm_up_for(config, both, view)

@@ -253,11 +253,7 @@ def _onnx_zoo(graph: Graph, boxes: str, scores: str) -> dict[str, str]:
 
 def _custom_vision(graph: Graph, boxes: str, scores: str) -> dict[str, str]:
     labels = graph.const([[0, 1]], np.int64)
-    return {
-        "detected_boxes": graph.batch(boxes),
-        "labels": labels,
-        "detected_scores": graph.batch(scores),
-    }
+    return {"detected_boxes": graph.batch(boxes), "labels": labels, "detected_scores": graph.batch(scores)}
 
 
 @pytest.mark.parametrize(

@@ -282,9 +282,7 @@ def test_the_links_at_the_start_open_the_page(host, port, state_folder, monkeypa
         tokens = json.loads((state_folder / "web-tokens.json").read_text())
         assert any(f"?token={tokens['operator']}" in one for one in page.links)
         assert len(page.links) == 2
-        assert all(f" or http://10.8.0.1:{port}/?token=" in one for one in page.links), (
-            "a network may have no names"
-        )
+        assert all(f" or http://10.8.0.1:{port}/?token=" in one for one in page.links), "some have no names"
 
 
 @pytest.mark.parametrize("content", ["", "nonsense", "[]", "[" * 99_999, '{"operator": "x", "viewer": "y"}'])

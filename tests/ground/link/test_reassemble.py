@@ -7,13 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.protocol.messages import MAX_MISSING_BASE, Flags
-from hvt_ground.link.reassemble import (
-    ORDERLY_UNITS,
-    RESEND_UNITS,
-    RESTART_SILENCE_NS,
-    Arrival,
-    Reassembler,
-)
+from hvt_ground.link.reassemble import ORDERLY_UNITS, RESEND_UNITS, RESTART_SILENCE_NS, Arrival, Reassembler
 from rigs.footprint import footprint_bytes
 from rigs.messages import UnitHeader
 

@@ -80,9 +80,7 @@ def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, ca
     assert boxes(0, 200) >= 1
     assert [boxes(index, 255) for index in range(1, 12)][-1] == 0
     (failed,) = models.failures.parts
-    assert (failed.part, failed.working, failed.count) == ("detector", False, 1), (
-        "it is left alone for a while"
-    )
+    assert (failed.part, failed.working, failed.count) == ("detector", False, 1), "it rests for a while"
     assert "out of data bounds" in failed.reason
     over[0] = True
     assert max(boxes(index, 200) for index in range(12, 24)) >= 1, "it was opened again"

@@ -74,12 +74,7 @@ class Rig:
     """An edge's port, thread and sessions."""
 
     def __init__(
-        self,
-        flight: Flight,
-        consumer: Consumer,
-        *,
-        pause: RetryPause | None = None,
-        patience_s: float = 5.0,
+        self, flight: Flight, consumer: Consumer, *, pause: RetryPause | None = None, patience_s: float = 5.0
     ) -> None:
         self.port, self.consumer, self.flight = Port(), consumer, flight
         self.port.inbox = self.inbox = WatchedInbox()

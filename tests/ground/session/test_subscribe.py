@@ -348,9 +348,7 @@ def test_an_edge_that_a_lost_subscription_keeps_silent_is_subscribed_to_again() 
     assert port.inbox.get(timeout_s=0) is not None
     assert port.inbox.get(timeout_s=0) is None, "it comes by several subscriptions, and is one message"
     link.ports()
-    assert {met_by(one) for one in list(declared)[24:]} == {*rows} - {Channel.STATUS}, (
-        "each may be lost alone"
-    )
+    assert {met_by(one) for one in list(declared)[24:]} == {*rows} - {Channel.STATUS}, "each may go alone"
     for row in rows:
         came(next(one for one in reversed(declared) if met_by(one) is row), channel=row)
     now_s[0] += 1

@@ -131,9 +131,7 @@ def test_one_that_has_ended_does_not_fail_any_more(failures):
     assert [one.working for one in failures.parts] == [False]
     failures.failed("recording of uav-1", "of the next session")
     failures.over("recording of uav-1", 1)
-    assert [one.reason for one in failures.now] == ["of the next session"], (
-        "the first ends after it has begun"
-    )
+    assert [one.reason for one in failures.now] == ["of the next session"], "the first ends after it began"
 
 
 def test_one_that_waits_for_a_keyframe_has_it_asked_for_once(failures):

@@ -328,9 +328,7 @@ def test_an_edge_waits_for_its_camera_and_can_be_stopped(caplog):
     with ThreadPoolExecutor(1) as pool:
         flight = pool.submit(Edge(check(config), stop=stop).run)
         try:
-            eventually(
-                lambda: "/dev/video97 does not exist" in caplog.text, what="it waits, and says for what"
-            )
+            eventually(lambda: "/dev/video97 does not exist" in caplog.text, what="it says what it waits for")
             assert not flight.done()
         finally:
             stop.set()

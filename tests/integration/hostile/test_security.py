@@ -291,11 +291,7 @@ def test_a_ground_that_gets_no_answer_on_control_is_told(
     caplog.set_level(logging.WARNING)
     endpoint = f"tls/127.0.0.1:{free_port}"
     settings = LinkSettings("ground", connect=(endpoint,), zenoh_config=fleet.bold("base"))
-    with (
-        _edge(fleet, endpoint),
-        open_session(settings) as session,
-        GroundLink(session, edges="*") as link,
-    ):
+    with _edge(fleet, endpoint), open_session(settings) as session, GroundLink(session, edges="*") as link:
         eventually(link.ports, what="the edge is seen")
         (port,) = link.ports()
         for _ in range(3):

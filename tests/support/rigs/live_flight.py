@@ -34,12 +34,7 @@ from hvt_edge.operating import Keyframes, KeyframeSettings, Rates
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
-from hvt_edge.video.encoder import (
-    Encoder,
-    encoder_settings,
-    keyframe_floor_bytes,
-    minimum_bps,
-)
+from hvt_edge.video.encoder import Encoder, encoder_settings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.reconfigure import OpenEncoder, encoder_opener
 from hvt_edge.video.stage import Action
 from hvt_edge.wiring.link import make_budget, make_pacer
@@ -234,12 +229,7 @@ class LiveFlight:
             open_encoder = encoder_opener(encoder_plan(config, size), self.operating)
         encoder = open_encoder(first_rates(config, decimation))
         reconfiguration = make_reconfiguration(
-            self.operating,
-            config,
-            size,
-            self.transmitter,
-            open_encoder=open_encoder,
-            pacer=self.pacer,
+            self.operating, config, size, self.transmitter, open_encoder=open_encoder, pacer=self.pacer
         )
         self.backlog = None
         if store is not None:

@@ -378,9 +378,7 @@ def test_a_split_session_is_exported_as_one(recording, events, tmp_path):
         ]
         for folder in (whole, split)
     )
-    assert [still for still in several if still not in one] == [], (
-        "one of another file's end, at its beginning"
-    )
+    assert [still for still in several if still not in one] == [], "of another file's end, at its beginning"
     assert len({data for _, _, data in several}) >= 0.9 * len(one)
     assert len(several) <= len(one)
 

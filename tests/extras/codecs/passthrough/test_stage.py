@@ -154,9 +154,7 @@ def test_each_unit_goes_where_the_table_says(burst):
         assert ", ".join(one for one, yes in named.items() if yes) == goes, (link, keyframe, before, probes)
         assert (decision.codes, decision.keyframe) == (bool(goes), keyframe and bool(goes))
         rig.stage.encode(frame, decision, now_ns=rig.now_ns)
-        assert rig.keyframes.sent == sent + (keyframe and bool(goes)), (
-            "the camera's own is the one that comes"
-        )
+        assert rig.keyframes.sent == sent + (keyframe and bool(goes)), "the camera's own is what comes"
 
 
 def test_nothing_follows_a_unit_for_which_the_link_had_no_room_after_all(burst, monkeypatch):

@@ -81,7 +81,7 @@ def test_each_stranger_once_a_minute(tmp_path: Path) -> None:
     for at_s in range(100, 120, 2):
         assert shown(at_s, "0800000A:A001") == []
         assert shown(at_s + 1, "0800000A:A001", links=("10.0.0.8:40961",)) == [], (
-            "it takes its time, and is in"
+            "it takes its time and is in"
         )
         assert shown(at_s + 1.5) == []
     for number in range(6):

@@ -79,9 +79,7 @@ def test_an_old_device_that_speaks_first_hides_nothing(source, send, autopilot, 
     send(autopilot(system=255, version=1).heartbeat())
     one = autopilot()
     pose = wait_for(
-        source,
-        has="camera",
-        say=lambda: send(one.place(), one.attitude(), one.gimbal(90, -30, flags=64)),
+        source, has="camera", say=lambda: send(one.place(), one.attitude(), one.gimbal(90, -30, flags=64))
     )
     assert pose.camera.yaw_deg == pytest.approx(90, abs=0.01)
 

@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.values import Detections, Image, View, iou
-from hvt_ground.perception.stills.classify import (
-    CropReader,
-    NoReader,
-    ObjectReading,
-    object_crops,
-)
+from hvt_ground.perception.stills.classify import CropReader, NoReader, ObjectReading, object_crops
 from hvt_ground.perception.stills.decode import DecodedStill
 from hvt_models.redetection import Redetection, composite
 from media.onnx_models import colour_classifier
@@ -187,9 +182,7 @@ def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch
         for reading, class_id, still in zip(readings, truth.class_ids, stills, strict=False)
     ]
     assert sum(right) >= 11
-    assert [picture.shape for picture in seen] == [(720, 1200, 3)], (
-        "as large as the source, not as the network"
-    )
+    assert [picture.shape for picture in seen] == [(720, 1200, 3)], "as large as the source, not the network"
 
 
 @pytest.fixture
