@@ -27,9 +27,10 @@ _log = logging.getLogger(__name__)
 
 _MOSTLY = 0.5
 """Share of the steps from one number to the next that must be 1 for others to be gaps."""
-_USUAL = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"})
-_ENDINGS = _USUAL | {".jpe", ".jfif", ".jp2", ".pgm", ".ppm", ".pnm"}
-"""Beside usual ones the others are masks or depths of the same pictures."""
+_USUAL = (".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".png")
+_ENDINGS = (*_USUAL, ".jpe", ".jfif", ".jp2", ".pgm", ".ppm", ".pnm")
+"""Beside usual ones the others are masks or depths of the same pictures; so is 1.png beside 1.jpg."""
+_MOST_SERIES = 4
 
 
 def sequence_files(folder: Path) -> list[Path]:
@@ -47,6 +48,11 @@ def sequence_files(folder: Path) -> list[Path]:
             f"source folder {str(folder)!r} cannot be read ({error.strerror}): name another"
         ) from None
     files = [file for file in files if file.suffix.lower() in _USUAL] or files
+    ranks = {file: _ENDINGS.index(file.suffix.lower()) for file in files}
+    first: dict[str, int] = {}
+    for file, rank in ranks.items():
+        first[file.stem] = min(rank, first.get(file.stem, rank))
+    files = [file for file, rank in ranks.items() if rank == first[file.stem]]
     times = [re.fullmatch(r"(.*?)([0-9]+)\.([0-9]+)", file.stem) for file in files]
     found = [(one[1], int(one[2]), one[3]) for one in times if one]
     least = min((len(fraction) for *_, fraction in found), default=0)
@@ -80,6 +86,14 @@ def _gaps(files: list[Path]) -> str:
         return ""
     first = next(file for file, step in zip(files, steps, strict=False) if step > 1)
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
+
+
+def _series(files: list[Path]) -> str:
+    counts = Counter(re.sub(r"[0-9]+", "#", file.stem) for file in files)
+    if not 1 < len(counts) <= _MOST_SERIES or min(counts.values()) < 2:
+        return ""
+    names = ", ".join(f"{count} {name!r:.40}" for name, count in sorted(counts.items()))
+    return f"it holds several series by their names, and all are shown, in the order of these names: {names}"
 
 
 def _left_out(folder: Path, shown: Iterable[Path]) -> str:
@@ -129,6 +143,7 @@ class FolderSource(Source):
         if settings.source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
         notes(_gaps(self._files))
+        notes(_series(self._files))
         notes(_left_out(self._place, self._files))
         notes(_pages(shown))
         self.notes = notes.taken()

@@ -200,6 +200,17 @@ def test_files_that_are_no_pictures_by_their_names_are_said(tmp_path):
     assert [file.name for file in sequence_files(tmp_path)] == ["1.jfif"]
 
 
+def test_masks_beside_pictures_are_left_out_or_said(tmp_path):
+    """Each second picture was a mask, and the clip lasted twice as long, without a word."""
+    for pattern in ("{}.jpg", "{}.png", "{}_mask.png"):
+        write_pictures(tmp_path, pattern, (1, 2))
+    source, _ = play(tmp_path)
+    said = " ".join(source.notes)
+    assert [file.name for file in sequence_files(tmp_path)] == ["1.jpg", "1_mask.png", "2.jpg", "2_mask.png"]
+    assert "in the order of these names: 2 '#', 2 '#_mask'" in said
+    assert "left out by their endings: 2 .png" in said
+
+
 def test_a_folder_that_may_not_be_read_is_said(tmp_path, monkeypatch):
     """Another user's folder would be a traceback."""
     denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
