@@ -138,10 +138,10 @@ class FlightRecord:
         assert np.array_equal(overlay.track_ids, tracks.ids[rows]), "both are of the same list"
         return ObservedFrame(
             self._inside(overlay.boxes_base_px),
+            overlay.track_ids,
             overlay.classes,
-            ids=overlay.track_ids,
-            confidences=overlay.confidences,
-            classes_before=overlay.base_classes,
+            overlay.confidences,
+            overlay.base_classes,
             confidences_before=tracks.confidences[rows].astype(np.float32),
             origins=overlay.origins,
         )

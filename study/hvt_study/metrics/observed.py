@@ -24,8 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.values import Boxes
-from hvt_study.datasets.labels import FrameLabels, no_boxes, no_ids
+from hvt_study.datasets.labels import FrameLabels
 from hvt_study.metrics.judged import FrameView, LabelledFrame, no_numbers
 
 
@@ -61,7 +60,7 @@ class RefinedObject:
 
     still_sequence: int
     track_id: int
-    """The ground's; `contract.NO_ID` where no track matched."""
+    """The ground's; `NO_ID` of `hvt_study.datasets.labels` where no track matched."""
     at_s: float
     """Media time at which the ground knew."""
     name_before: str
@@ -84,14 +83,9 @@ def still_delays_ms(stills: Sequence[StillArrival]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class ObservedFrame:
-    """The ground's list at one source frame, with all that metrics need of it; N tracks."""
+class ObservedFrame(FrameView):
+    """The ground's list at one source frame, as it was shown, with all that metrics need of it; N tracks."""
 
-    boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
-    classes: tuple[str, ...] = ()
-    ids: npt.NDArray[np.int64] = field(default_factory=no_ids)
-    confidences: npt.NDArray[np.float32] = field(default_factory=no_numbers)
-    classes_before: tuple[str, ...] = ()
     confidences_before: npt.NDArray[np.float32] = field(default_factory=no_numbers)
     """(N,) of the last detection that was matched."""
     origins: tuple[str, ...] = ()
@@ -106,10 +100,6 @@ class ObservedFrame:
     refined: tuple[RefinedObject, ...] = ()
     """Objects that were named since the frame before."""
 
-    def refined_view(self) -> FrameView:
-        """The whole list, as it was shown."""
-        return FrameView(self.boxes_xyxy_px, self.ids, self.classes, self.confidences, self.classes_before)
-
     def base_view(self) -> FrameView:
         """The tracks that the base stream knows of, with names and confidences as without stills.
 
@@ -117,13 +107,13 @@ class ObservedFrame:
         their bits back to the video: the fair video-only figure is that of M0 at equal bits.
         """
         known = np.array([origin in ("base", "edge+base") for origin in self.origins], np.bool_)
-        names, confidences = self.classes_before, self.confidences_before
-        return FrameView(self.boxes_xyxy_px, self.ids, names, confidences, names).rows(known)
+        names, sure = self.names_before, self.confidences_before
+        return FrameView(self.boxes_xyxy_px, self.ids, names, sure, names).rows(known)
 
 
 def refined_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels]) -> list[LabelledFrame]:
     """Every frame of a flight (``FlightReport.lists``) as it was shown, with its labels."""
-    return [(truth, one.refined_view()) for one, truth in zip(lists, labels, strict=True)]
+    return list(zip(labels, lists, strict=True))
 
 
 def detected_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels]) -> list[LabelledFrame]:

@@ -173,11 +173,7 @@ class DdsGround:
         names = self._names(tracks.class_ids)
         confidences = tracks.confidences.astype(np.float32)
         return ObservedFrame(
-            self._inside(tracks.boxes_xyxy_px),
-            names,
-            ids=tracks.ids,
-            confidences=confidences,
-            classes_before=names,
+            *(self._inside(tracks.boxes_xyxy_px), tracks.ids, names, confidences, names),
             confidences_before=confidences,
             origins=("base",) * len(names),
             shown_s=(self._at_ns - self.started_ns) / 1e9,

@@ -68,7 +68,7 @@ def test_the_same_flight_twice(clip, flags):
     assert first.messages == second.messages
     assert first.link == second.link
     for one, other in zip(first.lists, second.lists, strict=True):
-        assert one.classes == other.classes
+        assert one.class_names == other.class_names
         assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
 
 
@@ -139,7 +139,7 @@ def test_a_ground_that_sees_nothing_is_sent_tracks(clip):
     report = flown(clip, *AUTO, ground_detector=Nothing())
     assert report.messages["tracks"] >= 3
     # The first second of its reports does not count; then the next comparison decides.
-    listed = [list(report.lists[frame].classes) for frame in range(40)]
+    listed = [list(report.lists[frame].class_names) for frame in range(40)]
     assert listed[:16] == [[]] * 16
     assert listed[34:] == [["car"]] * 6
     assert report.account.total_bps <= 200_000

@@ -158,4 +158,4 @@ def test_recording_changes_nothing_and_goes_to_another_process(flight):
     again = pickle.loads(pickle.dumps(flight))
     for one, other in zip(again.lists, flight.lists, strict=True):
         assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
-        assert (one.classes, one.stills, one.refined) == (other.classes, other.stills, other.refined)
+        assert (one.class_names, one.stills, one.refined) == (other.class_names, other.stills, other.refined)

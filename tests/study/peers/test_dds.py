@@ -81,14 +81,14 @@ def report(clip):
 def test_what_only_the_second_pass_shows_is_found(clip, report):
     """That is the whole idea of the peer; without it, it is video at half the budget."""
     assert len(report.lists) == FRAMES
-    assert all("bus" in report.lists[frame_index].classes for frame_index in range(2, FRAMES))
-    row = report.lists[20].classes.index("bus")
+    assert all("bus" in report.lists[frame_index].class_names for frame_index in range(2, FRAMES))
+    row = report.lists[20].class_names.index("bus")
     assert report.lists[20].confidences[row] == pytest.approx(0.8)
     assert f1_of(report, range(2, 40)) > 0.9
     # The first pass alone had 0.3 for it.
     alone = flown(clip, scale=0.3, high=0.3)
     assert alone.messages.get("roi", 0) == 0
-    assert alone.lists[20].confidences[alone.lists[20].classes.index("bus")] == pytest.approx(0.3)
+    assert alone.lists[20].confidences[alone.lists[20].class_names.index("bus")] == pytest.approx(0.3)
 
 
 def test_every_byte_of_both_passes_counts_once(report):
@@ -143,7 +143,7 @@ def test_the_same_flight_twice(clip, report):
     assert again.link == report.link
     assert again.line_bytes == report.line_bytes
     for one, other in zip(again.lists, report.lists, strict=True):
-        assert one.classes == other.classes
+        assert one.class_names == other.class_names
         assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
     assert flown(clip, scale=0.3, share=0.6).digest != report.digest
 
@@ -153,7 +153,7 @@ def test_an_empty_picture_asks_for_nothing(tmp_path_factory):
     pictures = [np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)] * 20
     report = flown(clip_of(pictures, tmp_path_factory.mktemp("empty")))
     assert set(report.line_bytes) == {"base"}
-    assert all(not len(one.classes) for one in report.lists)
+    assert all(not len(one.class_names) for one in report.lists)
     assert all(one.detections is not None for one in report.lists)
     assert len(report.lists) == 20
 

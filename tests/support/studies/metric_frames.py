@@ -47,7 +47,7 @@ def list_f1(report, frames, there):
     pairs = []
     for frame in frames:
         boxes, names = there(frame)
-        pairs.append((labels(*zip(boxes, names, strict=True)), report.lists[frame].refined_view()))
+        pairs.append((labels(*zip(boxes, names, strict=True)), report.lists[frame]))
     return class_score(judged(pairs)).f1
 
 
