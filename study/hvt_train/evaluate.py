@@ -102,25 +102,30 @@ def _matches(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], int]:
     """Scores, hits and number of objects of one class in one picture; greedy, best first, each object once."""
     counts = well_visible(picture)
-    mine = picture.class_ids == kind
-    wanted, ignored = picture.boxes_px[mine & counts], picture.boxes_px[~counts]
+    wanted, ignored = picture.boxes_px[(picture.class_ids == kind) & counts], picture.boxes_px[~counts]
     rows = found.class_ids == kind_found
     boxes, scores = found.boxes_xyxy_px[rows], found.confidences[rows]
-    table = iou(boxes, wanted)
-    hits, counted = np.zeros(len(boxes), bool), np.ones(len(boxes), bool)
-    for row in range(len(boxes)):
-        best = int(table[row].argmax()) if len(wanted) else -1
-        if best >= 0 and table[row, best] >= 0.5:
-            hits[row], table[:, best] = True, 0
-        elif len(ignored) and _inside_share(boxes[row], ignored).max() > 0.5:
-            counted[row] = False
+    hits = _hits(boxes, wanted)
+    counted = hits | (_inside_share(boxes, ignored).max(1, initial=0) <= 0.5)
     return scores[counted], hits[counted], len(wanted)
 
 
-def _inside_share(box: npt.NDArray[np.float32], others: Boxes) -> npt.NDArray[np.float32]:
-    """Share of the box that lies in each of the others."""
-    inner = (np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])).clip(0).prod(1)
-    return np.asarray(inner / max(float((box[2:] - box[:2]).prod()), 1e-9), np.float32)
+def _hits(boxes: Boxes, wanted: Boxes) -> npt.NDArray[np.bool_]:
+    """(N,) which boxes, best first, are on an object that none before them has taken."""
+    table = iou(boxes, wanted)
+    hits = np.zeros(len(boxes), np.bool_)
+    for row in range(len(boxes) if len(wanted) else 0):
+        best = int(table[row].argmax())
+        if table[row, best] >= 0.5:
+            hits[row], table[:, best] = True, 0
+    return hits
+
+
+def _inside_share(boxes: Boxes, others: Boxes) -> npt.NDArray[np.float32]:
+    """(N, M) share of each box that lies in each of the others."""
+    low, high = np.maximum(boxes[:, None, :2], others[:, :2]), np.minimum(boxes[:, None, 2:], others[:, 2:])
+    area = (boxes[:, 2:] - boxes[:, :2]).prod(1)[:, None]
+    return np.asarray((high - low).clip(0).prod(2) / np.maximum(area, 1e-9), np.float32)
 
 
 def average_precision(scores: npt.NDArray[np.float32], hits: npt.NDArray[np.bool_], total: int) -> float:
@@ -173,11 +178,7 @@ def evaluate_real(detector: Detector, frames: Sequence[Image], truth: Sequence[B
     hits = found = total = 0
     for frame, wanted in zip(frames, truth, strict=True):
         boxes = _vehicles(detector, frame)
-        table = iou(boxes, wanted)
-        for row in range(len(boxes)):
-            best = int(table[row].argmax()) if len(wanted) else -1
-            if best >= 0 and table[row, best] >= 0.5:
-                hits, table[:, best] = hits + 1, 0
+        hits += int(_hits(boxes, wanted).sum())
         found, total = found + len(boxes), total + len(wanted)
     return RealResult(hits / max(total, 1), hits / found if found else math.nan, total, len(frames))
 

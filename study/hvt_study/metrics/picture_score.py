@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import expit, logit
 
 from hvt_common.inference.class_names import kind_of
 from hvt_study.datasets.class_map import VEHICLE, VEHICLES
@@ -92,7 +93,7 @@ def fitted_line(confidences: npt.NDArray[np.float64], right: npt.NDArray[np.bool
     logits = np.column_stack((_logits(confidences), np.ones(len(confidences))))
     line = np.array([1.0, 0.0])
     for _ in range(20):
-        true = (1 + np.tanh(logits @ line / 2)) / 2
+        true = expit(logits @ line)
         bend = logits.T @ (logits * (true * (1 - true))[:, None]) + _EPSILON * np.eye(2)
         line += np.linalg.solve(bend, logits.T @ (target - true))
     return float(line[0]), float(line[1])
@@ -100,12 +101,11 @@ def fitted_line(confidences: npt.NDArray[np.float64], right: npt.NDArray[np.bool
 
 def along_line(confidences: npt.NDArray[np.float64], line: tuple[float, float]) -> npt.NDArray[np.float64]:
     """(N,) confidences after a line through their logits."""
-    return np.asarray((1 + np.tanh((line[0] * _logits(confidences) + line[1]) / 2)) / 2)
+    return np.asarray(expit(line[0] * _logits(confidences) + line[1]))
 
 
 def _logits(confidences: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    clipped = np.clip(confidences, _EPSILON, 1 - _EPSILON)
-    return np.asarray(np.log(clipped / (1 - clipped)))
+    return np.asarray(logit(np.clip(confidences, _EPSILON, 1 - _EPSILON)))
 
 
 def as_one(name: str) -> str:

@@ -145,25 +145,35 @@ class CodeObserver:
         self._read("composite", codes, [code_crop(picture, box) for box in boxes.tolist()], at_ns=at_ns)
 
     def _unread(self, channel: Channel, frame_index: int) -> list[CodeInView]:
-        """Codes that are whole in view in that frame and were not read right yet."""
-        known = self.evidence[channel]
-        return [
-            code
-            for code in self._views[frame_index]
-            if code.visible >= LEAST_VISIBLE
-            and code.object_id in self._codes
-            and not (code.object_id in known and known[code.object_id].right)
-        ]
+        return _unread(self._views[frame_index], self._codes, self.evidence[channel])
 
     def _read(
         self, channel: Channel, codes: Sequence[CodeInView], crops: Sequence[Image], *, at_ns: int
     ) -> None:
         at_s = (at_ns - self._started_ns) / 1e9
         shown_in: tuple[Channel, ...] = ("base", "composite") if channel == "base" else (channel,)
-        for code, reading in zip(codes, self._reader.read(crops), strict=True):
-            for one in shown_in:
-                evidence = self.evidence[one].setdefault(code.object_id, Evidence())
-                evidence.add(reading, code=code.text, at_s=at_s)
+        _read(self._reader, codes, crops, [self.evidence[one] for one in shown_in], at_s=at_s)
+
+
+def _unread(
+    views: Sequence[CodeInView], codes: Mapping[int, Code], known: Mapping[int, Evidence]
+) -> list[CodeInView]:
+    """Codes that are whole in view and were not read right yet."""
+    seen = (one for one in views if one.visible >= LEAST_VISIBLE and one.object_id in codes)
+    return [one for one in seen if not (one.object_id in known and known[one.object_id].right)]
+
+
+def _read(
+    reader: CodeReader,
+    codes: Sequence[CodeInView],
+    crops: Sequence[Image],
+    evidence: Sequence[dict[int, Evidence]],
+    *,
+    at_s: float,
+) -> None:
+    for code, reading in zip(codes, reader.read(crops), strict=True):
+        for known in evidence:
+            known.setdefault(code.object_id, Evidence()).add(reading, code=code.text, at_s=at_s)
 
 
 def _share(code: CodeInView, still: DecodedStill) -> float:
@@ -213,7 +223,9 @@ class Readings:
             with_codes = zip(self._context.sequence.clip.images(), self._views, strict=False)
             for frame_index, (image, views) in enumerate(with_codes):
                 if frame_index % _EVERY_FRAMES == 0:
-                    self._read_source(image, views, evidence, at_s=frame_index / NOMINAL_FPS)
+                    codes = _unread(views, self.codes, evidence)
+                    crops = [code_crop(image, one.box_source_px.tolist()) for one in codes]
+                    _read(self._reader, codes, crops, [evidence], at_s=frame_index / NOMINAL_FPS)
             return ReadFlight(self.source_size, NOMINAL_FPS, 0, 0, 0, {"base": evidence})
 
         return self._known(("source",), read)
@@ -244,21 +256,6 @@ class Readings:
         if found is None or not within(found.total_bps, target_bps):
             return None
         return self.flown(spec, budget_bps=found.budget_bps, fps=fps)
-
-    def _read_source(
-        self, image: Image, views: tuple[CodeInView, ...], evidence: dict[int, Evidence], *, at_s: float
-    ) -> None:
-        views = tuple(
-            one
-            for one in views
-            if one.object_id in self.codes
-            and one.visible >= LEAST_VISIBLE
-            and not (one.object_id in evidence and evidence[one.object_id].right)
-        )
-        crops = [code_crop(image, one.box_source_px.tolist()) for one in views]
-        for one, reading in zip(views, self._reader.read(crops), strict=True):
-            found = evidence.setdefault(one.object_id, Evidence())
-            found.add(reading, code=one.text, at_s=at_s)
 
     def _fly(self, spec: RunSpec, *, budget_bps: int, fps: float | None) -> ReadFlight:
         context = self._context

@@ -156,17 +156,22 @@ def _thermal(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
             yield data / "hit_uav" / part / picture["filename"], corners, kinds
 
 
+def _marks(table: str, **kinds: int) -> dict[str, list[list[float]]]:
+    """Kind, x1, y1, x2, y2 of our own marks, by picture; kinds that are not named count neither way."""
+    marks: dict[str, list[list[float]]] = {}
+    with resources.files("hvt_train.pictures").joinpath(table).open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            box = [float(row[name]) for name in ("x1", "y1", "x2", "y2")]
+            marks.setdefault(row["file"], []).append([kinds.get(row["kind"], -1), *box])
+    return marks
+
+
 def _road(data: Path) -> Iterator[_Labelled]:
     """Madison: vehicles, the small ones as cars, and the people that we marked (``madison_people.csv``).
 
     Only pictures of views that hover long enough to tell moving objects are taken: there, walking people are marked.
     """
-    marks: dict[str, list[tuple[int, list[float]]]] = {}
-    with resources.files("hvt_train.pictures").joinpath("madison_people.csv").open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            box = [float(row[name]) for name in ("x1", "y1", "x2", "y2")]
-            kind = _ID["pedestrian"] if row["kind"] == "person" else -1
-            marks.setdefault(row["file"], []).append((kind, box))
+    marks = _marks("madison_people.csv", person=_ID["pedestrian"])
     for path, rows in _pairs(data / "cats_madison"):
         if path.name not in marks:
             continue
@@ -174,11 +179,11 @@ def _road(data: Path) -> Iterator[_Labelled]:
         vehicles = rows[:, 1:]
         longest = (vehicles[:, 2:] - vehicles[:, :2]).max(1, initial=0) if len(vehicles) else np.zeros(0)
         kinds = [LARGE_VEHICLE if side > _LARGE_PX else _ID["car"] for side in longest]
-        people = [(kind, box) for kind, box in marks[path.name] if box[2] > 0]
+        people = [row for row in marks[path.name] if row[3] > 0]
         edge = [[0, 0, wide, _BORDER_PX], [0, high - _BORDER_PX, wide, high]]
         edge += [[0, 0, _BORDER_PX, high], [wide - _BORDER_PX, 0, wide, high]]
-        boxes = np.array([*vehicles.tolist(), *[box for _, box in people], *edge], np.float32)
-        yield path, boxes, np.array([*kinds, *[kind for kind, _ in people], -1, -1, -1, -1], np.int32)
+        boxes = np.array([*vehicles.tolist(), *[row[1:] for row in people], *edge], np.float32)
+        yield path, boxes, np.array([*kinds, *[row[0] for row in people], -1, -1, -1, -1], np.int32)
 
 
 def _water(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
@@ -195,13 +200,7 @@ def _water(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
 
 def _field(data: Path) -> Iterator[_Labelled]:
     """Woods, stones, shores and fields straight down: nothing but the cars of ``field_vehicles.csv`` is there."""
-    marks: dict[str, list[list[float]]] = {}
-    with resources.files("hvt_train.pictures").joinpath("field_vehicles.csv").open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            kind = _ID["car"] if row["kind"] == "car" else -1
-            marks.setdefault(row["file"], []).append(
-                [kind, *(float(row[name]) for name in ("x1", "y1", "x2", "y2"))]
-            )
+    marks = _marks("field_vehicles.csv", car=_ID["car"])
     for path in sorted((data / "field").glob("*.[jJ][pP][gG]")):
         rows = np.array(marks.get(path.name, []), np.float32).reshape(-1, 5)
         yield path, rows[:, 1:], rows[:, 0].astype(np.int32)

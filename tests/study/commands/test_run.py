@@ -314,24 +314,23 @@ def test_wrong_input_is_one_sentence(scene, tmp_path, capsys):
         assert sentence.rstrip("\n").splitlines()[-1].startswith("hvt-study: ")
 
 
-@pytest.mark.parametrize("command", ["run", "tune"])
-@pytest.mark.parametrize("wrong", ["--provider=gpuu", "--cache=a-file"])
-def test_means_that_cannot_be_are_refused_before_a_file_is_read(
-    command, wrong, tmp_path, monkeypatch, capsys
-):
+GPUU, CACHE = "--provider=gpuu", "--cache=a-file"
+
+
+@pytest.mark.parametrize(
+    ("words", "reads"),
+    [
+        *((("run", "demo:0-1", one), "arguments.open_datasets") for one in (GPUU, CACHE)),
+        *((("tune", "demo:0-1", "--method", "M5", one), "arguments.open_datasets") for one in (GPUU, CACHE)),
+        (("compare", "demo", "--detector", "aerial-nano", GPUU), "compare._plan"),
+        (("read", "demo:codes", GPUU), "read._plan"),
+    ],
+)
+def test_means_that_cannot_be_are_refused_before_a_file_is_read(words, reads, tmp_path, monkeypatch, capsys):
     """It took until a process had opened data and networks: a quarter of a minute for a slip of the pen."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a-file").touch()
-    monkeypatch.setattr("hvt_study.commands.arguments.open_datasets", None)
-    own = ("--method", "M5") if command == "tune" else ()
-    assert main([command, "demo:0-1", "--out", "out", *own, wrong]) == 2
-    assert wrong.partition("=")[2] in capsys.readouterr().err
+    monkeypatch.setattr(f"hvt_study.commands.{reads}", None)
+    assert main([*words, "--out", "out"]) == 2
+    assert words[-1].partition("=")[2] in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("words", [("compare", "demo", "--detector", "aerial-nano"), ("read", "demo:codes")])
-def test_a_provider_that_is_not_here_is_refused_before_a_file_is_read(words, tmp_path, monkeypatch, capsys):
-    """The same for who compares one clip."""
-    monkeypatch.setattr(f"hvt_study.commands.{words[0]}._plan", None)
-    assert main([*words, "--out", str(tmp_path / "out"), "--provider", "gpuu"]) == 2
-    assert "--provider 'gpuu' is not known" in capsys.readouterr().err

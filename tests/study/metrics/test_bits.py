@@ -27,16 +27,6 @@ def test_the_parts_add_up_to_the_whole():
     assert line_rates({}, seconds=1.0)["total_bps"] == 0
 
 
-def test_the_pilots_accounting():
-    """59 stills of 300 frames at 15 fps; the pilot printed 1.123 a second, which is by a clip of 52.5 s."""
-    stills = [still(number, size=1500) for number in range(59)]
-    span_s, clip_s = 300 / 15, 52.5
-    assert still_counts(stills, [], seconds=clip_s)["stills_per_min"] / 60 == pytest.approx(1.124, abs=0.001)
-    assert still_counts(stills, [], seconds=span_s)["stills_per_min"] / 60 == pytest.approx(2.95)
-    rates = [line_rates({"roi": 59 * 1500}, seconds=one)["roi_bps"] for one in (span_s, clip_s)]
-    assert rates[0] / rates[1] == pytest.approx(2.625)
-
-
 @pytest.mark.parametrize(
     "rate",
     [lambda: line_rates({"base": 1}, seconds=math.nan), lambda: still_counts([], [], seconds=0.0)],

@@ -119,11 +119,6 @@ def test_a_share_is_rounded_once():
     assert decimals(picture_score(frames, detection_score(frames))["precision"]) == "0.805"
 
 
-def test_nothing():
-    """A sequence without a frame is an answer, not a crash."""
-    assert math.isnan(detection_score(judged([])).mean.at_50)
-
-
 def average_precision(frames, threshold):
     """Of one class: greedy matching by confidence within each frame, precision at 101 recalls."""
     hits, total = [], 0
