@@ -2,15 +2,19 @@
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import parse_size
 from hvt_scene import Scene
 from hvt_study.commands.arguments import option
 from hvt_study.commands.output import ONE_TARGET, print_columns, print_lines
+from hvt_study.datasets.labels import FrameLabels, check_inside, check_pixels
 from hvt_study.metrics.classes import ClassScore
+from hvt_study.metrics.judged import FrameView
 from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
 
 _ROWS: tuple[tuple[str, Callable[[ClassScore], float]], ...] = (
@@ -38,22 +42,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    width, height = parse_size(arguments.size, name="--size")
+    width, height = size = parse_size(arguments.size, name="--size")
     names = [name.strip() for name in arguments.classes.split(",")]
     if not all(names):
         raise UserError(
             f"--classes {arguments.classes!r} has an empty name: give names between commas, from class 1 on"
         )
     truth, one_target = read_truth(arguments.truth, class_names=names)
+    _check(arguments.truth, truth, size)
     columns: list[tuple[str, ClassScore]] = []
     for spec in arguments.tracks:
         name, separator, path = spec.rpartition("=")
         file = Path(path)
         label = name if separator else file.stem
         tracks = read_tracks(file)
+        _check(file, tracks, size)
         columns.append((label, score(tracks, truth, frame_area_px=width * height)))
     _print(columns, one_target=one_target)
     return 0
+
+
+def _check(path: Path, frames: Mapping[int, FrameLabels | FrameView], size: tuple[int, int]) -> None:
+    # Of truth in the source's pixels no track of the base stream would meet an object.
+    boxes = np.concatenate([np.empty((0, 4), np.float32), *(one.boxes_xyxy_px for one in frames.values())])
+    check_pixels(path, boxes)
+    remedy = "both files are in pixels of the base stream, and --size WxH says its size"
+    check_inside(path, boxes, size, remedy=remedy)
 
 
 def _print(columns: Sequence[tuple[str, ClassScore]], *, one_target: bool) -> None:

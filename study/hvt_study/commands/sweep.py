@@ -3,6 +3,7 @@
 import argparse
 import csv
 import io
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from hvt_edge.stills.policy.paper import SELECTORS
 from hvt_study.commands.arguments import check_whole, option
 from hvt_study.commands.output import check_out, print_columns, writing
 from hvt_study.datasets.annotation_rows import LARGEST
+from hvt_study.datasets.labels import check_inside, check_pixels
 
 COLUMNS = ("policy", "selected", "ratio", "frame_coverage")
 _INPUT_COLUMNS = ("frame", "x1", "y1", "x2", "y2", "conf", "class")
@@ -63,8 +65,11 @@ def sweep(frames: Mapping[int, RawDetections], *, frame_area_px: float) -> list[
     return rows
 
 
-def read_csv(path: Path) -> dict[int, RawDetections]:
-    """Read raw detections, columns ``frame,x1,y1,x2,y2,conf,class`` with a header, by frame in the file's order."""
+def read_csv(path: Path, size: tuple[int, int]) -> dict[int, RawDetections]:
+    """Read raw detections, columns ``frame,x1,y1,x2,y2,conf,class`` with a header, by frame in the file's order.
+
+    ``size`` is (width, height) of the frames in pixels. Raises `UserError` for a line, or boxes, that are not so.
+    """
     grouped: dict[int, list[tuple[list[float], float, str]]] = {}
     try:
         with io.StringIO(read_text(path, most=MOST_TABLE_BYTES), newline="") as file:
@@ -73,6 +78,9 @@ def read_csv(path: Path) -> dict[int, RawDetections]:
                 grouped.setdefault(frame, []).append((box, confidence, name))
     except (OSError, csv.Error) as error:
         raise UserError(f"{path} cannot be read ({error}): give a CSV file of detections") from None
+    boxes = np.array([box for found in grouped.values() for box, _, _ in found], np.float64).reshape(-1, 4)
+    check_pixels(path, boxes)
+    check_inside(path, boxes, size, remedy="say their size with --size")
     return {
         frame: RawDetections(
             np.array([box for box, _, _ in found], np.float64).reshape(-1, 4),
@@ -108,9 +116,14 @@ def _parsed(line: dict[str, str], *, path: Path, number: int) -> tuple[int, list
         name = line["class"].strip()
     except (ValueError, TypeError, AttributeError):
         raise UserError(f"{path} line {number} is not {','.join(_INPUT_COLUMNS)}: {line}") from None
-    if not all(abs(value) < LARGEST for value in numbers) or not name:  # nor for NaN
+    if not all(abs(value) < LARGEST for value in numbers) or not re.search(r"[^\W\d_]", name):  # nor for NaN
         raise UserError(
-            f"{path} line {number} has a number that is not below {LARGEST:g}, or no class: {line}"
+            f"{path} line {number} has a number that is not below {LARGEST:g}, or no name of a class: {line}"
+        )
+    x1, y1, x2, y2, confidence = numbers
+    if not (x1 <= x2 and y1 <= y2 and 0 <= confidence <= 1):
+        raise UserError(
+            f"{path} line {number} has corners that are exchanged, or a conf that is not from 0 to 1: {line}"
         )
     return frame, numbers[:4], numbers[4], name
 
@@ -164,7 +177,7 @@ def _from_csv(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections], 
             f"--size is missing: {arguments.source} does not say how large its frames are, for example 1280x720"
         )
     width, height = parse_size(arguments.size, name="--size")
-    return read_csv(arguments.source), float(width * height)
+    return read_csv(arguments.source, (width, height)), float(width * height)
 
 
 def _from_clip(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections], float]:

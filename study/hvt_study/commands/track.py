@@ -13,6 +13,7 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Tracks
 from hvt_study.datasets.annotation_rows import LAST_FRAME, Rows, read_rows
+from hvt_study.datasets.labels import check_pixels
 
 _MOT = "frame,id,x,y,w,h,score"
 _REMEMBERED = 3
@@ -28,6 +29,7 @@ def read_detections(path: Path) -> Rows:
     rows = read_rows(path, columns=_MOT, least=7)
     score, ids = rows["score"], rows["id"]
     rows.only((score >= 0) & (score <= 1), accepted="a score from 0 to 1 in column 7")
+    check_pixels(path, [rows[side] for side in "xywh"])
     if len(rows):
         with_id = ids[0] >= 0
         rows.only(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -169,8 +170,13 @@ def check_pixels(path: Path, numbers: npt.ArrayLike) -> None:
         raise UserError(f"{path} has boxes of 0 to 1, and boxes are in pixels there")
 
 
-def check_inside(path: Path, boxes: Boxes, size: tuple[int, int]) -> None:
-    """Raise `UserError` where boxes of a file lie outside its pictures of (width, height): others were labelled.
+RIGHT_PICTURES = "put the pictures back that were labelled, as large and turned as they were"
+
+
+def check_inside(
+    path: Path, boxes: npt.NDArray[Any], size: tuple[int, int], *, remedy: str = RIGHT_PICTURES
+) -> None:
+    """Raise `UserError` where boxes of a file lie outside its pictures of (width, height): it is of others.
 
     Boxes without an area say that the object is not there.
     """
@@ -179,8 +185,7 @@ def check_inside(path: Path, boxes: Boxes, size: tuple[int, int]) -> None:
     outside = ((centres < 0) | (centres > size)).any(axis=1).sum()
     if outside > _MOST_OUTSIDE * len(boxes):
         raise UserError(
-            f"{path} has {outside} of {len(boxes)} boxes outside its pictures of {size[0]}x{size[1]}: put the "
-            "pictures back that were labelled, as large and turned as they were"
+            f"{path} has {outside} of {len(boxes)} boxes outside its pictures of {size[0]}x{size[1]}: {remedy}"
         )
 
 

@@ -172,10 +172,12 @@ def test_a_wrong_line_is_named(tmp_path, capsys, line, accepted):
 def test_wrong_files_and_arguments_are_one_sentence(tmp_path, capsys):
     """The user would be shown a traceback in place of what to change."""
     source, out = write(tmp_path / "det.txt", moving([1, 2])), ("--out", tmp_path / "out.txt")
+    shares = write(tmp_path / "shares.txt", ["1,-1,.1,.1,.2,.2,0.5\n"])
     binary = tmp_path / "model.onnx"
     binary.write_bytes(b"\x08\x07\xff\xfe\x80")
     for words, said in (
         (("track", tmp_path / "none.txt", *out), "none.txt cannot be read"),
+        (("track", shares, *out), "shares.txt has boxes of 0 to 1, and boxes are in pixels there"),
         (("track", binary, *out), "not UTF-8 text"),
         (("track", tmp_path, *out), "cannot be read"),
         (("track", source, "--out", tmp_path / "no" / "out.txt"), "cannot be written"),

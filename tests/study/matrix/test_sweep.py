@@ -50,6 +50,14 @@ def test_known_answer(tmp_path, capsys):
         (DETECTIONS.partition("\n")[0], "has no raw detections"),
         *((DETECTIONS + f"7,0,0,{x},9,0.5,car\n", "not below 1e+09") for x in ("nan", "1e300")),
         (DETECTIONS + "7,0,0,x,9,0.5,car\n", "line 8"),
+        (DETECTIONS + "7,0,0,9,9,50,car\n", "line 8 has corners that are exchanged, or a conf that is not"),
+        (DETECTIONS + "7,9,0,0,9,0.5,car\n", "line 8 has corners that are exchanged"),
+        (DETECTIONS + "7,0,0,9,9,0.5,2\n", "or no name of a class"),
+        (DETECTIONS.partition("\n")[0] + "\n0,.1,.1,.2,.2,.5,car\n", "has boxes of 0 to 1"),
+        (
+            DETECTIONS + "7,700,0,900,9,.5,car\n",
+            "1 of 7 boxes outside its pictures of 640x480: say their size",
+        ),
         (DETECTIONS + "7,0\n", "line 8"),
         (DETECTIONS + f"7,0,0,9,9,0.5,{'x' * 200_000}\n", "cannot be read (field larger than field limit"),
     ],
@@ -78,7 +86,7 @@ def test_a_table_of_a_spreadsheet_keeps_its_order(tmp_path):
     """Some write a byte order mark before the first name; ties are broken by the order of the file."""
     source = tmp_path / "detections.csv"
     source.write_text(DETECTIONS, encoding="utf-8-sig")
-    found = read_csv(source)
+    found = read_csv(source, (640, 480))
     assert (len(found), found[0].class_names) == (3, ("car", "truck", "car", "dog"))
 
 

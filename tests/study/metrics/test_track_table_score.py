@@ -105,6 +105,10 @@ def test_perfect_tracks_of_the_demo_score_one(tmp_path, capsys):
     assert "ours" in printed
     assert printed.count("1.000") >= 4
     assert "│ objects on all frames               │     3 │" in printed
+    assert main(["score", str(tracks_path), "--truth", str(truth_path), "--size", "64x64"]) == 2
+    assert (
+        "gt.txt has 1 of 3 boxes outside its pictures of 64x64: both files are in" in capsys.readouterr().err
+    )
 
 
 def test_wrong_files_are_one_sentence(tmp_path, capsys):
