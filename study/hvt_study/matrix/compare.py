@@ -104,7 +104,7 @@ class CompareResult:
     def one_target(self) -> bool:
         """Whether one object is labelled and nothing else: recall can be said of it, and how steadily it is held."""
         return all(row["named_f1"] is None for row in self.rows) and any(
-            row["gaps"] is not None for row in self.rows
+            row["found_share"] is not None for row in self.rows
         )
 
     @property

@@ -202,11 +202,12 @@ def _judge() -> Any:
 class Continuity:
     """Continuity of the labelled objects of one sequence."""
 
-    objects: int
     found_share: float
     """Mean over objects of the share of their frames at which they are found, 0…1; NaN without objects."""
-    gaps: int
-    longest_gap: int
+    gaps: int | None
+    """None where no object was ever found, as ``longest_gap``: else who finds nothing would hold it best."""
+    longest_gap: int | None
+    """Frames; 0 where there is no gap."""
 
 
 def continuity(frames: Iterable[Judged]) -> Continuity:
@@ -218,13 +219,13 @@ def continuity(frames: Iterable[Judged]) -> Continuity:
         for row, number in enumerate(one.ids.tolist()):
             if number != NO_ID:
                 lives.setdefault(number, []).append(row in found)
+    found_ever = any(map(any, lives.values()))
     gaps = [gap for life in lives.values() for gap in _gaps(life)]
     shares = [sum(life) / len(life) for life in lives.values()]
     return Continuity(
-        objects=len(lives),
         found_share=sum(shares) / len(shares) if shares else math.nan,
-        gaps=len(gaps),
-        longest_gap=max(gaps, default=0),
+        gaps=len(gaps) if found_ever else None,
+        longest_gap=max(gaps, default=0) if found_ever else None,
     )
 
 

@@ -27,7 +27,13 @@ def plan(clip="my clip.mp4", models=MODELS):
 
 def row(method, named_f1, *, rate=200.0, half=0, **more):
     shape = {"set_fps": 3.0 if "-" in method and method[0:2] == "M0" else None}
-    shape |= {"base_width": 960, "base_height": 540, "picture_age_p95_ms": 90.0, "recall": None, "gaps": None}
+    shape |= {
+        "base_width": 960,
+        "base_height": 540,
+        "picture_age_p95_ms": 90.0,
+        "recall": None,
+        "found_share": None,
+    }
     return {"method": method, "rate_kbps": rate, "half": half, "named_f1": named_f1, **shape, **more}
 
 
@@ -59,7 +65,7 @@ FEWER = ", .110 more than the next, M0-fps."
         ),
         # Of one target recall decides: nobody knows what else is in view.
         (
-            [row("M0", None, recall=0.2, gaps=1), row("M6", None, recall=0.5, gaps=2)],
+            [row("M0", None, recall=0.2), row("M6", None, recall=0.5)],
             "fly M6: recall .500",
             "",
         ),
@@ -77,6 +83,12 @@ def test_the_best_one_is_named_with_its_lead(rows, begins, ends):
     assert bool(one.command) == begins.startswith("fly")
     if ends == FEWER:
         assert one.command == "hvt-edge --source 'my clip.mp4' --budget 200kbps --size 960x540 --profile thin"
+
+
+@pytest.mark.parametrize("found_share", [0.0, None])
+def test_one_target_that_nobody_finds_is_a_target(found_share):
+    """A clip that was lost at every rate would be called one without labels."""
+    assert result(row("M0", None, found_share=found_share)).one_target is (found_share is not None)
 
 
 def test_each_rate_has_a_verdict():

@@ -148,18 +148,20 @@ def flight(life):
 def test_gaps_begin_after_the_first_find_and_no_stray_box_counts():
     """A target that is lost again and again would look as good as one that is held, or one that is found late."""
     one = continuity(judged(flight("--+++-++---+-")))
-    assert (one.objects, one.gaps, one.longest_gap) == (1, 3, 3)
+    assert (one.gaps, one.longest_gap) == (3, 3)
     assert one.found_share == 6 / 13
 
 
 def test_what_is_never_found_has_no_gaps():
-    """Else who never finds it would hold it best."""
-    one = continuity(judged(flight("---")))
-    assert (one.found_share, one.gaps, one.longest_gap) == (0.0, 0, 0)
+    """Neither some nor 0, or who never finds it would hold it best."""
+    for life, gaps in (("---", None), ("--+", 0)):
+        one = continuity(judged(flight(life)))
+        assert (one.gaps, one.longest_gap) == (gaps, gaps)
+        assert one.found_share == life.count("+") / 3
 
 
 def test_labels_without_ids_say_nothing():
     """Reference labels do not know which object is which."""
     one = continuity(judged([(labels((square(0), "car")), view((square(0), "car")))]))
-    assert one.objects == 0
+    assert one.gaps is None
     assert math.isnan(one.found_share)
