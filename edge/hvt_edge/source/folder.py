@@ -88,6 +88,11 @@ def _gaps(files: list[Path]) -> str:
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
+def _below(folder: Path) -> str:
+    found = sorted({file.parent.name for file in folder.glob("*/*") if names_picture(file)})
+    return f" of its own, its folder {found[0]!r:.80} does" if found else ""
+
+
 def _series(files: list[Path]) -> str:
     counts = Counter(re.sub(r"[0-9]+", "#", file.stem) for file in files)
     if not 1 < len(counts) <= _MOST_SERIES or min(counts.values()) < 2:
@@ -131,7 +136,9 @@ class FolderSource(Source):
         self._files = sequence_files(self._place)
         if not self._files:
             endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
-            raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
+            raise UserError(
+                f"source folder {spec!r} holds no images{_below(self._place)}; accepted endings are {endings}"
+            )
         notes = Notes(spec)
         self._stretch = Stretch(notes)
         images = ((read_picture(file, self._stretch), file) for file in self._files)

@@ -525,8 +525,9 @@ def test_a_page_is_no_camera(jpegs, monkeypatch):
 
 def test_missing_and_unusable_files_are_one_sentence(tmp_path):
     """A typing error would end in a traceback."""
-    for folder in ("bare", "broken"):
-        (tmp_path / folder).mkdir()
+    for folder in ("bare", "broken", "sequence/img1"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "sequence/img1/1.jpg").touch()
     (tmp_path / "empty.mp4").touch()
     (tmp_path / "notes.txt").write_text("not a video\n" * 50)
     (tmp_path / "noise.mp4").write_bytes(np.random.default_rng(0).bytes(20_000))
@@ -545,7 +546,8 @@ def test_missing_and_unusable_files_are_one_sentence(tmp_path):
         "notes.txt": "video",
         "noise.mp4": "noise.mp4",
     }
-    said |= {"bare": "no images", "broken": "none of which", "tone.wav": "no video"}
+    said |= {"bare": "no images;", "sequence": "no images of its own, its folder 'img1' does;"}
+    said |= {"broken": "none of which", "tone.wav": "no video"}
     for name, words in (said | {"phone.mp4": "is a HEIC picture: convert it to JPEG"}).items():
         assert words in refused(tmp_path / name)
 
