@@ -287,8 +287,8 @@ def _table_row(line: Mapping[str, str | None], where: str) -> _Values:
     return row
 
 
-def _points(text: str, path: Path) -> list[ET.Element]:
-    # Of a track, else of a route, else waypoints; of a file that breaks off those that are whole.
+def _points(text: str, path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
+    # Of a track, else of a route, else waypoints; of a file that breaks off those that are whole. And whole tracks.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"pose file {path} declares a document type, which no GPS track has")
     points: dict[str, list[ET.Element]] = {}
@@ -307,12 +307,17 @@ def _points(text: str, path: Path) -> list[ET.Element]:
         raise UserError(f"pose file {path} is no GPX: {broken}")
     if broken:
         _log.warning("pose file %s breaks off after %d points: %s", path, len(found), broken)
-    return found
+    return found, points.get("trk", [])
 
 
 def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     untimed = 0
-    for number, point in enumerate(_points(text, path), 1):
+    points, tracks = _points(text, path)
+    number_of = {
+        point: number for number, track in enumerate(tracks) for point in track.iterfind(".//{*}trkpt")
+    }
+    times: dict[int, list[float]] = {}
+    for number, point in enumerate(points, 1):
         where = f"pose file {path}, point {number}"
         time = point.findtext("{*}time")
         if time is None:
@@ -330,7 +335,12 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
         except UserError as error:
             yield error
             continue
+        times.setdefault(number_of.get(point, len(tracks)), []).append(row["utc_s"])
         yield row
+    # The middle half of each: before a fix receivers say any time.
+    spans = sorted((sorted(one)[len(one) // 4], sorted(one)[-1 - len(one) // 4]) for one in times.values())
+    if any(first[1] > second[0] for first, second in pairwise(spans)):
+        raise UserError(f"pose file {path} has {len(spans)} tracks of the same time: keep the camera's alone")
     if untimed:
         _log.warning("pose file %s: %d points have no time, and are left out", path, untimed)
 

@@ -68,6 +68,7 @@ def track(seconds, *, elevation="512.4"):
     return f'<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
 
 
+TWO_TRACKS = track([0, 1, 2, 3]).replace("</gpx>", track([0, 1, 2, 3]).partition(">")[2])
 ERRORS = f"{PLACE},position_error_m,height_error_m,angle_error_deg\n0,1,2,0.01,0.02,0.05\n"
 COLUMNS = (
     "utc,latitude_deg,longitude_deg,height_m,yaw_deg,pitch_deg,camera_yaw_deg,camera_pitch_deg,hfov_deg,angle_error_deg\n"
@@ -186,6 +187,7 @@ FIRST = MINI.split("2\n00:", maxsplit=1)[0]
         ("a.srt", "nothing", "no row with a time"),
         ("a.gpx", "<gpx>", "no GPX"),
         ("a.gpx", "<!DOCTYPE x [<!ENTITY a 'b'>]><gpx/>", "document type"),
+        ("a.gpx", TWO_TRACKS, "has 2 tracks of the same time: keep the camera's alone"),
         ("a.kml", "<kml/>", "none of .csv"),
         ("a.csv", TABLE + f"2,1,2,{'3' * 200_000}\n", "is no table: field larger than"),
         ("a.csv", f"{'n' * 200_000},latitude_deg\n", "is no table: field larger than"),
