@@ -15,6 +15,8 @@ from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink, Sink
 
 _MOST_ENDED = 3
+_LATE_S = 2.0
+"""From this age on a picture is not that of now, as on the page."""
 
 
 def status_text(state: GroundState) -> str:
@@ -41,6 +43,8 @@ def _edge_text(one: EdgeState) -> str:
         not_sent = session.stills_not_sent
         why = f" (not sent: {counts_text(not_sent, most=2)})" if not_sent else ""
         age = "" if session.delay_p50_ms is None else f"  {session.delay_p50_ms:.0f} ms"
+        if age and session.picture_age_s is not None and session.picture_age_s > _LATE_S:
+            age = f"  LATE, {session.picture_age_s:.0f} s old"
         if session.total_bps is not None:
             rate = f"{bitrate_text(round(session.total_bps))} of {bitrate_text(session.budget_bps)}"
         else:

@@ -297,6 +297,9 @@ def test_who_flies_is_told_before_those_that_have_landed(ground, landed, said):
     flies = replace(state.edges[0], session=session)
     state = replace(state, edges=(flies,))
     assert "  290 kbps of 300 kbps" in status_text(state)
+    old = replace(session, delay_p50_ms=150.0, picture_age_s=19.4)
+    late = status_text(replace(state, edges=(replace(flies, session=old),)))
+    assert late.endswith("  LATE, 19 s old"), "it said 150 ms, the middle one of the flight"
     gone = (replace(flies, edge=f"uav-{number}", link="ended", session=None) for number in range(landed))
     assert status_text(replace(state, edges=(*gone, flies))) == f"{status_text(state)} | {said}"
 
