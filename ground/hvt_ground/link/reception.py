@@ -85,7 +85,7 @@ class Reception:
         self.lockstep = info.pace == "lockstep"
         self.budget_bps = self.highest_budget_bps = info.budget_bps
         self.method = info.method
-        """As they are now, some seconds late, and the highest budget since this ground joined."""
+        """As they are now, some seconds late, and the highest budget that this ground learned of."""
         self.ledger = Ledger(window_ns=info.window_ns)
         self.receive_latency, self.overlay_latency = LatencyStats(), LatencyStats()
         self.clock_offset = edge_clock
