@@ -30,7 +30,9 @@ _MOSTLY = 0.5
 _USUAL = (".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".png")
 _ENDINGS = (*_USUAL, ".jpe", ".jfif", ".jp2", ".pgm", ".ppm", ".pnm")
 """Beside usual ones the others are masks or depths of the same pictures; so is 1.png beside 1.jpg."""
-_MOST_SERIES = 4
+_MOST_SERIES = 9
+_PNG, _PNG_KIND, _PNG_COLOUR = b"\x89PNG", 25, 2
+"""How the file begins, the place of its colour type, and that type's bit for colour."""
 
 
 def sequence_files(folder: Path) -> list[Path]:
@@ -191,8 +193,8 @@ class FolderSource(Source):
 def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.0) -> Image | None:
     """(height, width, 3) uint8 BGR, turned by its EXIF data; None where it is no picture that can be read.
 
-    More than eight bits are a sensor's levels: ``stretch`` has those of the pictures before; ``at_s`` is the time at
-    which it is shown, in seconds.
+    Deep grey is a sensor's levels: ``stretch`` has those of the pictures before; ``at_s`` is the time at which it is
+    shown, in seconds.
     """
     try:
         data = np.fromfile(file, np.uint8)
@@ -200,8 +202,12 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
             return None
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
         deep = stretch or Stretch(lambda _: None)
-        if image is not None and image.itemsize > 1 and image.ndim == 2:
-            return deep.bgr(image, at_s=at_s)
+        if image is not None and image.itemsize > 1:
+            if data[:4].tobytes() == _PNG and not data[_PNG_KIND] & _PNG_COLOUR:
+                # OpenCV repeats grey that has transparency.
+                image = image.reshape(*image.shape[:2], -1)[..., 0]
+            if image.ndim == 2:
+                return deep.bgr(image, at_s=at_s)
         if image is not None and image.dtype == np.uint16:
             return deep.colours(np.asarray(image, np.uint16)[..., :3])
         # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.

@@ -27,8 +27,8 @@ _UNTAGGED_SD_PX = 576
 """A picture without a colour matrix is BT.601 up to this number of lines, else BT.709, as in players."""
 _DEEP_BITS = 10
 """Grey of more bits is a sensor's levels, not brightness."""
-_SENSOR_BITS, _MOST_BITS = (10, 12, 14), 16
-"""Cameras leave the upper ones of sixteen bits empty, and no header says so."""
+_MOST_BITS, _DARK = 16, 1 << 14
+"""Cameras of 14 bits and fewer leave the upper ones of sixteen empty. No header says so: it may as well be night."""
 _COLOURS = 3
 """Components of a pixel in colour: a palette has one, grey with transparency two."""
 _HDR = {16: "PQ", 18: "HLG"}
@@ -258,18 +258,17 @@ class Stretch:
         self._note = note
         self._range: tuple[float, float] | None = None
         self._at_s = 0.0
-        self._bits = 0
-        """Of colours: as many as the brightest so far needs."""
+        self._coloured = False
 
     def colours(self, levels: npt.NDArray[np.uint16]) -> Image:
-        """(height, width, 3) BGR of sixteen bits, of which a camera may use the lower ones alone, as uint8."""
-        needed = int(levels.max()).bit_length()
-        bits = next((bits for bits in _SENSOR_BITS if needed <= bits), _MOST_BITS)
-        if bits > self._bits:
-            self._bits = bits
-            if bits < _MOST_BITS:
-                self._note(f"its 16-bit colours go up to {levels.max()}: they are taken for {bits} bits")
-        return np.asarray(cv2.convertScaleAbs(levels, alpha=255 / (2**self._bits - 1)), np.uint8)
+        """(height, width, 3) BGR of sixteen bits as uint8; that the first picture is dark is noted."""
+        if not self._coloured and 0 < levels.max() < _DARK:
+            self._note(
+                f"its 16-bit colours go up to {levels.max()} of 65535 in the first picture, which is dark: if its "
+                "camera has 10, 12 or 14 bits, multiply the values by 64, 16 or 4 first"
+            )
+        self._coloured = True
+        return np.asarray(cv2.convertScaleAbs(levels, alpha=1 / 257), np.uint8)
 
     def bgr(self, levels: npt.NDArray[Any], *, at_s: float, bits: int = 0) -> Image:
         """(height, width) numbers as (height, width, 3) uint8; ``at_s`` is the picture's time in seconds.

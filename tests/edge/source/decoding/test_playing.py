@@ -321,17 +321,31 @@ def test_pictures_of_heat_in_a_folder_are_stretched_too(tmp_path, unseen):
         assert "stretched" in " ".join(source.notes)
 
 
-@pytest.mark.parametrize(("most", "bits"), [(1000, 10), (4095, 12), (16_000, 14), (65_535, 16)])
-def test_colours_of_a_sensor_are_as_bright_as_its_bits(tmp_path, most, bits):
-    """Twelve bits in a TIFF or PNG of sixteen were nearly black, without a word."""
-    levels = np.full((60, 80, 3), (0, most // 2, most), np.uint16)
-    for name in ("0.tiff", "0.png"):
-        cv2.imwrite(str(tmp_path / name), levels)
-    share = most / (2**bits - 1)
-    for place in (tmp_path / "0.tiff", tmp_path / "0.png", tmp_path):
+def test_grey_with_transparency_is_stretched_in_a_folder_too(tmp_path):
+    """The file alone was stretched, and in a folder nearly the same grey all over."""
+    frame = av.VideoFrame(64, 48, "ya16be")
+    grey = np.where(np.arange(48)[:, None] < 24, 7000, 7200).repeat(64, axis=1)
+    frame.planes[0].update(np.dstack([grey, np.full_like(grey, 65_535)]).astype(">u2").tobytes())
+    coder = av.CodecContext.create("png", "w")
+    coder.width, coder.height, coder.pix_fmt, coder.time_base = 64, 48, "ya16be", Fraction(1, 25)
+    (tmp_path / "0.png").write_bytes(b"".join(map(bytes, [*coder.encode(frame), *coder.encode(None)])))
+    for place in (tmp_path / "0.png", tmp_path):
         source, pictures = play(place)
-        assert pictures[0][30, 40].tolist() == pytest.approx([0, 127.5 * share, 255 * share], abs=2)
-        assert (f"taken for {bits} bits" in " ".join(source.notes)) == (bits < 16)
+        assert pictures[0][(10, 40), 30, 0].tolist() == [0, 255]
+        assert "stretched" in " ".join(source.notes)
+
+
+@pytest.mark.parametrize("most", [(1000, 1023, 40_000, 900), (16_384, 900, 65_535), (0, 900, 40_000)])
+def test_dark_colours_of_sixteen_bits_stay_dark_and_are_said(tmp_path, most):
+    """Night was as bright as day, and jumped as the light grew; a camera's twelve bits were dark without a word."""
+    for number, one in enumerate(most):
+        cv2.imwrite(str(tmp_path / f"{number}.tiff"), np.full((60, 80, 3), (0, one // 2, one), np.uint16))
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((60, 80, 3), (0, most[0] // 2, most[0]), np.uint16))
+    for place, shown in ((tmp_path / "0.tiff", most[:1]), (tmp_path / "0.png", most[:1]), (tmp_path, most)):
+        source, pictures = play(place)
+        for picture, one in zip(pictures, shown, strict=False):
+            assert picture[30, 40].tolist() == pytest.approx([0, one / 514, one / 257], abs=1)
+        assert (f"go up to {most[0]} of 65535" in " ".join(source.notes)) == (most[0] == 1000)
 
 
 @pytest.mark.parametrize(
