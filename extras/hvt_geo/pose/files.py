@@ -98,7 +98,8 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
             f"pose file {path} is no table: {error}; accepted are lines of values between commas"
         ) from None
     if not poses:
-        raise UserError(f"pose file {path} has no row with a time, a latitude and a longitude")
+        lacks = f"pose file {path} has no row with a time, a latitude and a longitude"
+        raise UserError("; ".join((lacks, *notes)))
     poses = [one if one.hfov_deg is not None else replace(one, hfov_deg=hfov_deg) for one in poses]
     poses = _together(_in_order(poses, path), path)
     apart_s = (

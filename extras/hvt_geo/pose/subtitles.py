@@ -8,19 +8,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 _FULL_FRAME_MM = 36.0
 """Width of the picture that 35 mm equivalent focal lengths are said for."""
-_NUMBER = r"[+-]?(?:\d++[.,]\d++|\d++(?! \d))(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d|\.\d)"
-"""With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06, 47 06.1, 47.06.01."""
+_NUMBER = r"[+-]?\d++(?:[.,]\d++)?+(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d)"
+"""With a point, or with the comma that half of Europe writes; not the degrees alone of 47°06'01"."""
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
 _SIDE = r"(?i:([EWNS]|east|west|north|south))"
-_BEHIND = rf"\s?°?\s?{_SIDE}\b(?!\s*:)"
-_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}(?:{_BEHIND})?")
-_HEMISPHERES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER}){_BEHIND}")
-"""Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter or word behind the number, of one of both at least."""
-_UNREAD = re.compile(
-    r"\d\s+\d|(?<![^\W\d_])(?!(?i:[ewnsm]|east|west|north|south|ft|feet|sats?)(?![^\W\d_]))[^\W\d_]"
+_BEHIND = rf"\s?(?:°|deg)?\s?{_SIDE}\b(?!\s*:)"
+_LATLON = r"(?i:l(?:at|ongt?)itude)\s{0,4}[:(]"
+_NAMED = re.compile(
+    rf"\b(?!{_LATLON}\s*[+-]?\d++(?:[ :]\d|[.,]\d++\.\d))"
+    rf"([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}(?:{_BEHIND})?"
 )
-"""Degrees and minutes, or a word that is no unit and no side: such a place is not read."""
+"""But for latitudes and longitudes of 47 06.1, 47:06:01 or 47.06.01, whose degrees alone are another place."""
+_DEGREES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER})(?:{_BEHIND}|(?:\s?deg\b)?(?!\s+[\d+-]))")
+"""Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter or word behind the number, of one of both at least; or none."""
+_SAYS_PLACE = re.compile(rf"\b(?:GPS\s*\(|{_LATLON})[^\],;)\n]{{0,40}}?\d")
+"""A number where the first of a place stands, whether it is read or not."""
 _GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
 _HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})(?:\s*m\b|{_FEET[3:-2]})")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
@@ -53,9 +56,8 @@ def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[st
     ends = (*(time.start() for time in times[1:]), len(text))
     blocks = [(time, text[time.end() : end]) for time, end in zip(times, ends, strict=False)]
     founds = [found[1] for _, body in blocks if (found := _GPS.search(body)) is not None]
-    places = [_numbers(found) for found in founds if not _HEMISPHERES.search(found)]
-    latitude_first = _latitude_first([one for one in places if len(one) >= 2], note)
-    unplaced = 0
+    latitude_first = _latitude_first(founds, note)
+    unplaced = unread = 0
     said: set[str] = set()
     for time, body in blocks:
         row = {"time_s": _seconds(time), **_values(body, latitude_first=latitude_first)}
@@ -65,11 +67,17 @@ def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[st
             said.add("its digital zoom is not read: give a table with hfov_deg")
         place = row.get("latitude_deg"), row.get("longitude_deg")
         if None in place or not any(place):  # both are 0 before there is a fix
-            unplaced += 1
+            is_said = None in place and _SAYS_PLACE.search(body) is not None
+            unread += is_said
+            unplaced += not is_said
             continue
         yield row
     for sentence in sorted(said):
         note(sentence)
+    if unread:
+        note(
+            f"{unread} of its {len(blocks)} blocks have a place that is not understood: accepted are decimal degrees"
+        )
     if unplaced:
         note(f"{unplaced} of its {len(blocks)} blocks have no place, as before there is a fix")
 
@@ -79,11 +87,11 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
     if (height := _HEIGHT.search(body)) is not None:
         row["height_m"] = _value(height[1], feet=height[2])
     for whose, angles in _ANGLES.findall(body):
-        values = _numbers(angles)
+        values = [_value(one[0]) for part in _parts(angles) if (one := re.match(_NUMBER, part)) is not None]
         prefix = "camera_" if whose == "G" else ""
         if len(values) == 3:
             angle_names = (f"{prefix}pitch_deg", f"{prefix}roll_deg", f"{prefix}yaw_deg")
-            row |= {name: value for name, (value, _) in zip(angle_names, values, strict=True)}
+            row |= dict(zip(angle_names, values, strict=True))
     for name, said, feet, letter in _NAMED.findall(body):
         if name.lower() in _DJI:
             least, parts = _IN_PARTS.get(name.lower(), (0, 1))
@@ -99,26 +107,30 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
 
 def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
     found = _GPS.search(body)
-    if found is None or _UNREAD.search(found[1]):
+    if found is None or (degrees := _degrees(found[1])) is None:
         return {}
-    place = _numbers(found[1])
-    if letters := _HEMISPHERES.findall(found[1]):
-        values = [((before or behind)[0].upper(), _value(one or two)) for before, one, two, behind in letters]
-        said = {
-            "longitude_deg" if letter in "EW" else "latitude_deg": -abs(value) if letter in "WS" else value
-            for letter, value in values  # some write the sign as well
-        }
-        if len(said) == 1 and len(place) >= 2:  # of the first two numbers the other one is the other
-            other = place[values[0][0] in place[0][1]][0]
-            said = dict.fromkeys(_NEGATIVE, other) | said
-        return said
-    if len(place) < 2:
-        return {}
-    names = ("latitude_deg", "longitude_deg") if latitude_first else ("longitude_deg", "latitude_deg")
-    return {name: value for name, (value, _) in zip(names, place, strict=False)}
+    said, first, second = degrees
+    names = ("latitude_deg", "longitude_deg")
+    names = names if (latitude_first if said is None else said) else names[::-1]
+    return dict(zip(names, (first, second), strict=True))
 
 
-def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callable[[str], None]) -> bool:
+def _degrees(text: str) -> tuple[bool | None, float, float] | None:
+    # (whether the letters say that the latitude is first, both numbers); None where more, or less, is in their place.
+    place = "; ".join(_parts(text)[:2])
+    found = _DEGREES.findall(place)
+    sides = [(before or behind)[:1].upper() for before, _, _, behind in found]
+    kinds = {(side in "NS") == (index == 0) for index, side in enumerate(sides) if side}
+    if len(found) != 2 or len(kinds) > 1 or re.search(r"\w", _DEGREES.sub("", place)):
+        return None
+    first, second = (
+        -abs(value) if side in ("W", "S") else value  # some write the sign as well
+        for side, value in zip(sides, (_value(one or two) for _, one, two, _ in found), strict=True)
+    )
+    return next(iter(kinds), None), first, second
+
+
+def _latitude_first(founds: Sequence[str], note: Callable[[str], None]) -> bool:
     """Which of the first two numbers of GPS(…) is the latitude; the third is its height, or a count of satellites.
 
     | numbers | first is |
@@ -128,28 +140,37 @@ def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callabl
     | a third with a unit, a fraction, or beyond 60: a height | the latitude (enterprise models, goggles) |
     | else | the longitude (Phantom, Mavic); it is said that this is a guess |
     """
+    places = [
+        (*degrees[1:], (*_parts(one), "", "")[2])
+        for one in founds
+        if (degrees := _degrees(one)) is not None and degrees[0] is None
+    ]
     if not places:
         return False
-    if any(abs(one[0][0]) > _MOST_LATITUDE for one in places):
+    if any(abs(first) > _MOST_LATITUDE for first, _, _ in places):
         return False
-    if any(abs(one[1][0]) > _MOST_LATITUDE for one in places):
+    if any(abs(second) > _MOST_LATITUDE for _, second, _ in places):
         return True
-    if any(len(one) > 2 and not (one[2][1].isdigit() and one[2][0] <= _MOST_SATELLITES) for one in places):
+    if any(_is_height(third) for _, _, third in places):
         note("its GPS(…) is taken for latitude, longitude, height, because the third number is a height")
         return True
     note("its GPS(…) is taken for longitude, latitude, satellites, as most models write: look at the map")
     return False
 
 
-def _numbers(text: str) -> list[tuple[float, str]]:
-    # (value, how it is written) of numbers between commas, with decimal points or decimal commas.
+def _is_height(text: str) -> bool:
+    count = re.sub(r"(?i)\W*sat[a-z]*\W*", "", text)
+    return re.match(_NUMBER, text) is not None and not (count.isdecimal() and int(count) <= _MOST_SATELLITES)
+
+
+def _parts(text: str) -> list[str]:
+    # Between commas, with decimal points or decimal commas.
     parts = re.split(r"\s*(?:,\s+|;)\s*", text.strip())
-    if len(parts) < 2:
+    if len(parts) < 2 and "." not in text:
         parts = text.strip().split(",")
-        if "." not in text and len(parts) >= 4:
+        if len(parts) >= 4:
             parts = [f"{parts[0]}.{parts[1]}", f"{parts[2]}.{parts[3]}", ".".join(parts[4:])]
-    found = [(re.match(_NUMBER, one), one) for one in parts]
-    return [(_value(number[0]), one) for number, one in found if number is not None]
+    return [one for part in parts for one in (part.split(",") if "." in part else [part])]
 
 
 def _value(text: str, *, feet: str | None = None) -> float:

@@ -159,6 +159,7 @@ def test_beyond_its_ends_and_in_a_gap_a_file_says_nothing(tmp_path):
 
 
 FIRST = MINI.split("2\n00:", maxsplit=1)[0]
+UNREAD = "1 of its 1 blocks have a place that is not understood"
 
 
 @pytest.mark.parametrize(
@@ -196,11 +197,13 @@ FIRST = MINI.split("2\n00:", maxsplit=1)[0]
         ("a.csv", f"{PLACE},angle_error_deg\n0,1,2,-0.1\n", "angle_error_deg is -0.1, accepted is 0.001 to"),
         ("a.srt", FIRST.replace("00:00:00,000 -->", f"{'9' * 400}:00:00,000 -->", 1), "no row"),
         ("a.srt", FIRST.replace("00:00:00,000 -->", f"{'9' * 5000}:00:00,000 -->", 1), "no row"),
-        ("a.srt", "00:00:00,000 -->\nGPS(47°06'01\"N, 8°30'00\"E, 50m)\n", "no row"),
-        ("a.srt", "00:00:00,000 -->\nGPS(47 06.5N, 8 30.1E, 50m)\n", "no row"),
-        ("a.srt", "00:00:00,000 -->\n[latitude: 47 06.5] [longitude: 8.5]\n", "no row"),
-        ("a.srt", "00:00:00,000 -->\n[latitude: 47.06.01] [longitude: 8.5]\n", "no row"),
-        ("a.srt", "00:00:00,000 -->\nGPS(33.25 Süd, 70.5 Ouest, 50)\n", "no row"),
+        ("a.srt", "00:00:00,000 -->\nGPS(47°06'01\"N, 8°30'00\"E, 50m)\n", UNREAD),
+        ("a.srt", "00:00:00,000 -->\n[latitude: 47:06:01] [longitude: 8.5]\n", UNREAD),
+        ("a.srt", "00:00:00,000 -->\nGPS(n/a,n/a,0)\n", "no place, as before there is a fix"),
+        ("a.srt", "00:00:00,000 -->\nGPS(47 06.5N, 8 30.1E, 50m)\n", UNREAD),
+        ("a.srt", "00:00:00,000 -->\n[latitude: 47 06.5] [longitude: 8.5]\n", UNREAD),
+        ("a.srt", "00:00:00,000 -->\n[latitude: 47.06.01] [longitude: 8.5]\n", UNREAD),
+        ("a.srt", "00:00:00,000 -->\nGPS(33.25 Süd, 70.5 Ouest, 50)\n", UNREAD),
         ("a.srt", MINI.replace("00:00:01,000 -->", "9999:00:01,000 -->"), "time_s is 3.59964e"),
         ("a.srt", MINI.replace("pitch: -45.0", "pitch: -95.0"), "camera_pitch_deg is -95, accepted is -92"),
     ],
@@ -259,6 +262,11 @@ def test_a_fixed_camera_is_where_it_was_put():
         ("GPS(116.2,40.1,69.800) BAROMETER(91.2)", (40.1, 116.2, 91.2), ""),
         ("GPS(36.9,-5.3,120)", (36.9, -5.3, None), "latitude, longitude, height"),
         ("GPS(8.2,47.4,16) BAROMETER:1.9", (47.4, 8.2, 1.9), "longitude, latitude, satellites"),
+        ("GPS(8.2,47.4,n/a) BAROMETER:20 2017.01.01", (47.4, 8.2, 20), "longitude, latitude, satellites"),
+        ("GPS(8.2,47.4,alt: 16.5)", (47.4, 8.2, None), "longitude, latitude, satellites"),
+        ("GPS(8.2,47.4,12 satellites)", (47.4, 8.2, None), "longitude, latitude, satellites"),
+        ("GPS(8.2, 47.4,12, 3D)", (47.4, 8.2, None), "longitude, latitude, satellites"),
+        ("GPS(36.9,-5.3,15 m AGL)", (36.9, -5.3, None), "latitude, longitude, height"),
         ("GPS(11,5000,48,1000,16) BAROMETER:50,5", (48.1, 11.5, 50.5), "longitude, latitude, satellites"),
         ("GPS (11,5000, 48,1000, 16)", (48.1, 11.5, None), "longitude, latitude, satellites"),
         ("GPS(48,1000,11,5000,20,5M)", (48.1, 11.5, None), "latitude, longitude, height"),
@@ -355,7 +363,9 @@ def test_subtitles_are_told_apart_by_their_times(tmp_path, change):
         "GPS(W: 70.5, S: 33.25, 30.5m)",
         "GPS(W: -70.5, S: 33.25, 30.5m)",
         "GPS(33.25S, 70.5°W, 30)",
-        "GPS(33.25S, -70.5, 30)",
+        "GPS(33.25 s, -70.5, 30 m, N12)",
+        "GPS(33.25S 70.5W)",
+        "GPS(W: 70.5, S: 33.25, ASL: 30.5m)",
         "GPS(-70.5, 33.25 S, 30)",
         "GPS(S 33.25, W70.5, 30.5m)",
         "GPS(33.25 South, 70.5 west, 30)",
