@@ -175,7 +175,8 @@ def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) ->
     beside = [one for home in homes for one in home.parent.glob(f"{escape(home.name)}[._]*")]
     files = (one for folder in folders for one in sorted(folder.iterdir()))
     names, sizes = {os.fsencode(one.name) for one in pictures}, {len(pictures), *homes.values()}
-    stems, parts = set() if known else {one.stem for one in pictures}, {home.name for home in homes}
+    stems = set() if known else {one.stem for one in pictures}
+    parts = {home.name: count for home, count in homes.items()}
     kinds = {(path.parent, path.suffix) for path in known}
     unread = []
     for path in islice((one for one in (*files, *beside) if _may_hold_labels(one, known)), _LOOKED_INTO):
@@ -195,8 +196,8 @@ def check_unread(place: Path, pictures: Sequence[Path], used: Iterable[Path]) ->
             ):
                 rows = len(_BOX.findall(listed))
                 # UAV123 has a list, and one for each part, of a folder of that name.
-                of_folder = _PART.sub("", path.stem) in parts
-                if (rows > 1 and (rows in sizes or of_folder)) or _has_boxes(start, names, alike=alike):
+                is_part = rows < parts.get(_PART.sub("", path.stem), 0)
+                if (rows > 1 and (rows in sizes or is_part)) or _has_boxes(start, names, alike=alike):
                     unread.append(path)
     if sure and not known:
         path, what = next(iter(sure.items()))
@@ -257,10 +258,12 @@ def coco_files(place: Path) -> list[Path]:
     """COCO's files of a set: those of usual names, and of ``annotations/``."""
     folders = _open_folders(place, 1)
     found = [folder / name for folder in folders for name in _COCO if (folder / name).is_file()]
-    files = sorted((place / "annotations").glob("[!.]*.json"))
-    files = [one for one in files if not one.name.startswith(_NO_OBJECTS)]
+    files, beside = (
+        [one for one in sorted(folder.glob("[!.]*.json")) if not one.name.startswith(_NO_OBJECTS)]
+        for folder in (place / "annotations", place)
+    )
     found += [one for one in files if one.name.startswith(_COCO_BOXES)] or files
-    return found or [one for one in sorted(place.glob("[!.]*.json")) if _is_coco(one)]
+    return found or [one for one in beside if _is_coco(one)]
 
 
 def _is_coco(path: Path) -> bool:

@@ -351,6 +351,7 @@ REFUSED = [
         {"annotations/stuff_a.json": coco(), "annotations/panoptic_a.json": "{}"},
         "but for captions_…, panoptic",
     ),
+    ({"stuff_a.json": coco(), "panoptic_a.json": coco()}, UNREAD),
     ({"images/a.xml": "<kml/>"}, r"a\.xml is not an XML of Pascal VOC \(its root is kml"),
     # Of labels in pixels nothing is right; of classes from 1, each would be the next one, and the last left out.
     (
@@ -409,7 +410,7 @@ def test_files_beside_pictures_that_are_no_labels_are_passed_over(tmp_path):
     "files",
     [
         {"anno/bike1.txt": "NaN,NaN,NaN,NaN\n20,10,60,50\n"},  # UAV123
-        {"anno/img_2.txt": "20,10,60,50\n" * 5},
+        {"anno/img_2.txt": "20,10,60,50\n" * 2, "img/c.jpg": "", "img/d.jpg": ""},
         {"img/groundtruth_rect.2.txt": "20\t10\t60\t50\n" * 2},  # OTB, of two targets
         {"export/a.ndjson": '{"external_id": "a.jpg", "projects": {"annotations": {"objects": []}}}'},
         {"gt/a.txt": ROW},
@@ -438,6 +439,7 @@ NO_LABELS = {
     "ImageSets/Main/train.txt": "a\n1\n2\n3\n4\n",
     "runs/train/results.csv": NUMBERS,
     "calib.npz": "x",
+    "images_1.txt": "47.1 8.5 100 1\n" * 3,
     "rec/tracks.csv": "frame,x_min,y_min,x_max,y_max\n" + NUMBERS,
     "odm/stats.json": '{"bbox": [1, 2, 3, 4]}',
     "sparse/0/images.txt": "1 0.5 0.5 0.5 0.5 1 2 3 1 a.jpg\n",
