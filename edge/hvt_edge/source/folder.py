@@ -27,9 +27,9 @@ _log = logging.getLogger(__name__)
 
 _MOSTLY = 0.5
 """Share of the steps from one number to the next that must be 1 for others to be gaps."""
-_USUAL = (".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".png")
+_USUAL = (".jpg", ".jpeg", ".webp", ".bmp", ".png", ".tif", ".tiff")
 _ENDINGS = (*_USUAL, ".jpe", ".jfif", ".jp2", ".pgm", ".ppm", ".pnm")
-"""Beside usual ones the others are masks or depths of the same pictures; so is 1.png beside 1.jpg."""
+"""Beside usual ones the others are masks or depths of the same pictures; so is 1.png beside 1.jpg, or 1.tif."""
 _MOST_SERIES = 9
 _PNG, _PNG_KIND, _PNG_COLOUR = b"\x89PNG", 25, 2
 """How the file begins, the place of its colour type, and that type's bit for colour."""
@@ -50,11 +50,7 @@ def sequence_files(folder: Path) -> list[Path]:
             f"source folder {str(folder)!r} cannot be read ({error.strerror}): name another"
         ) from None
     files = [file for file in files if file.suffix.lower() in _USUAL] or files
-    ranks = {file: _ENDINGS.index(file.suffix.lower()) for file in files}
-    first: dict[str, int] = {}
-    for file, rank in ranks.items():
-        first[file.stem] = min(rank, first.get(file.stem, rank))
-    files = [file for file, rank in ranks.items() if rank == first[file.stem]]
+    files = _one_a_name(files)
     times = [re.fullmatch(r"(.*?)([0-9]+)\.([0-9]+)", file.stem) for file in files]
     found = [(one[1], int(one[2]), one[3]) for one in times if one]
     least = min((len(fraction) for *_, fraction in found), default=0)
@@ -62,6 +58,21 @@ def sequence_files(folder: Path) -> list[Path]:
     if len(found) == len(files) and any(one[0] == "0" and len(one) > least for *_, one in found):
         return [file for _, file in sorted(zip(found, files, strict=True))]
     return sorted(files, key=lambda file: _natural(file.name))
+
+
+def _one_a_name(files: list[Path]) -> list[Path]:
+    # Of files of one name that of the first ending is shown. A thumbnail has a usual ending too: where in the first
+    # such name another file is a larger picture, its ending is the first.
+    named: dict[str, list[Path]] = {}
+    ranks = {ending: rank for rank, ending in enumerate(_ENDINGS)}
+    for file in sorted(files, key=lambda file: (ranks[file.suffix.lower()], file.name)):
+        named.setdefault(file.stem, []).append(file)
+    alike = next((same for same in named.values() if len(same) > 1), [])
+    sizes = [0 if image is None else image.size for image in map(read_picture, alike)]
+    if all(sizes) and alike:
+        ranks[alike[sizes.index(max(sizes))].suffix.lower()] = -1
+    firsts = {name: min(ranks[file.suffix.lower()] for file in same) for name, same in named.items()}
+    return [file for file in files if ranks[file.suffix.lower()] == firsts[file.stem]]
 
 
 def names_picture(file: Path) -> bool:
@@ -97,17 +108,20 @@ def _below(folder: Path) -> str:
 
 def _series(files: list[Path]) -> str:
     counts = Counter(re.sub(r"[0-9]+", "#", file.stem) for file in files)
-    if not 1 < len(counts) <= _MOST_SERIES or min(counts.values()) < 2:
+    series = sorted((name, count) for name, count in counts.items() if count > 1)
+    if not 1 < len(series) <= _MOST_SERIES:
         return ""
-    names = ", ".join(f"{count} {name!r:.40}" for name, count in sorted(counts.items()))
-    return f"it holds several series by their names, and all are shown, in the order of these names: {names}"
+    names = ", ".join(f"{count} {name!r}" for name, count in series)
+    return f"it holds several series by their names, and all are shown: {names}"
 
 
-def _left_out(folder: Path, shown: Iterable[Path]) -> str:
-    found = [file for file in {*folder.glob("[!.]*")}.difference(shown) if file.is_file()]
-    counts = Counter(file.suffix.lower() or "without one" for file in found)
+def left_out(folders: Iterable[Path], shown: Iterable[Path], *, pictures: bool = False) -> str:
+    """A sentence on the files in folders, or on their ``pictures`` alone, that are not ``shown``; empty for none."""
+    found = {file for folder in folders for file in folder.glob("[!.]*")}.difference(shown)
+    kinds = [file for file in found if file.is_file() and (names_picture(file) or not pictures)]
+    counts = Counter(file.suffix.lower() or "without one" for file in kinds)
     said = ", ".join(f"{count} {ending}" for ending, count in sorted(counts.items()))
-    return said and f"files are left out by their endings: {said}"
+    return said and f"files are left out by their endings, or beside others of their names: {said}"
 
 
 def _pages(file: Path) -> str:
@@ -153,7 +167,7 @@ class FolderSource(Source):
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
         notes(_gaps(self._files))
         notes(_series(self._files))
-        notes(_left_out(self._place, self._files))
+        notes(left_out([self._place], self._files))
         notes(_pages(shown))
         self.notes = notes.taken()
         self._first = first

@@ -16,7 +16,7 @@ from urllib.parse import unquote
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
-from hvt_edge.source.folder import sequence_files
+from hvt_edge.source.folder import left_out, sequence_files
 from hvt_study.datasets import label_files
 from hvt_study.datasets.annotation_rows import LARGEST, label_text
 from hvt_study.datasets.label_table import image_labels
@@ -125,6 +125,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     files = label_files.pictures_below(place)
     if not files:
         raise UserError(f"{place} holds no pictures, nor do its folders")
+    doubts.beside = left_out({file.parent for file in files}, files, pictures=True)
     folders = label_files.Folders()
     found = {
         file: labels for file in files if (labels := label_files.label_file(file, place, folders)) is not None
@@ -188,7 +189,7 @@ def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> lis
     read = label_files.coco_files(place)
     found = [one for path in read for one in _coco_pictures(path, doubts)]
     if found:
-        doubts.unread = label_files.check_unread(place, files, read)
+        doubts.unread, doubts.beside = label_files.check_unread(place, files, read), ""  # each is named
         return found
     if any((place / folder).is_dir() for folder in ("labels", "annotations", "Annotations")):
         some = f"any of its {len(files)} pictures, such as {files[0].name}"

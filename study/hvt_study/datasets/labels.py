@@ -83,6 +83,8 @@ class LabelDoubts:
     classes: int = 0
     unread: str = ""
     """A sentence on files that nobody understood."""
+    beside: str = ""
+    """A sentence on pictures that are left out."""
     _clipped: int = 0
     _worst: tuple[float, str] = (0.0, "")
     _left_out: int = 0
@@ -140,7 +142,7 @@ class LabelDoubts:
         return inside, np.flatnonzero(solid)
 
     def sentences(self) -> list[str]:
-        said = [self.unread] if self.unread else []
+        said = [one for one in (self.beside, self.unread) if one]
         if self._clipped:
             px, where = self._worst
             said.append(

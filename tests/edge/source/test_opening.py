@@ -196,7 +196,7 @@ def test_files_that_are_no_pictures_by_their_names_are_said(tmp_path):
         (tmp_path / name).write_bytes(cv2.imencode(".jpg", numbered(1))[1])
     source, _ = play(tmp_path)
     assert source.frame_count == 1
-    assert "left out by their endings: 1 .avif, 2 .heic, 1 without one" in source.notes[-1]
+    assert "others of their names: 1 .avif, 2 .heic, 1 without one" in source.notes[-1]
     assert [file.name for file in sequence_files(tmp_path)] == ["1.jfif"]
 
 
@@ -204,11 +204,36 @@ def test_masks_beside_pictures_are_left_out_or_said(tmp_path):
     """Each second picture was a mask, and the clip lasted twice as long, without a word."""
     for pattern in ("{}.jpg", "{}.png", "{}_mask.png"):
         write_pictures(tmp_path, pattern, (1, 2))
+    write_pictures(tmp_path, "cover.jpg", (9,))
     source, _ = play(tmp_path)
     said = " ".join(source.notes)
-    assert [file.name for file in sequence_files(tmp_path)] == ["1.jpg", "1_mask.png", "2.jpg", "2_mask.png"]
-    assert "in the order of these names: 2 '#', 2 '#_mask'" in said
-    assert "left out by their endings: 2 .png" in said
+    names = ["1.jpg", "1_mask.png", "2.jpg", "2_mask.png", "cover.jpg"]
+    assert [file.name for file in sequence_files(tmp_path)] == names
+    assert "all are shown: 2 '#', 2 '#_mask'" in said
+    assert "left out by their endings, or beside others of their names: 2 .png" in said
+
+
+def test_each_of_a_drones_series_is_said_by_its_whole_name(tmp_path):
+    """Five bands of one flight were one film without a word, or had all the same name."""
+    bands = [f"a_flight_over_the_vineyard_behind_the_{band}" for band in ("g", "r", "re", "nir", "rgb")]
+    for band in bands:
+        write_pictures(tmp_path, "{}_" + band + ".png", (1, 2))
+    said = " ".join(play(tmp_path)[0].notes)
+    assert all(f"2 '#_{band}'" in said for band in bands)
+
+
+@pytest.mark.parametrize(
+    ("shown", "size", "other"), [(".png", 1, ".tiff"), (".tif", 2, ".jpg"), (".jpg", 1, ".png")]
+)
+def test_of_files_of_one_name_the_picture_is_shown(tmp_path, shown, size, other):
+    """Depth was shown in place of colours, and a thumbnail in place of its photograph."""
+    for number in range(2):
+        small = np.full((32, 32), 5, np.float32 if other == ".tiff" else np.uint8)
+        cv2.imwrite(str(tmp_path / f"{number}{other}"), small)
+        cv2.imwrite(str(tmp_path / f"{number}{shown}"), np.full((32 * size, 32 * size, 3), 92, np.uint8))
+    source, frames = play(tmp_path)
+    assert [frame.source_bgr[9, 9, 0] for frame in frames] == [92, 92]
+    assert f"names: 2 {other}" in " ".join(source.notes)
 
 
 def test_a_folder_that_may_not_be_read_is_said(tmp_path, monkeypatch):

@@ -375,6 +375,14 @@ REFUSED = [
 ]
 
 
+def test_pictures_that_are_left_out_of_a_set_are_said(tmp_path):
+    """A set was half as large as its folder, without a word."""
+    lay(tmp_path, "a.jpg", "a.png", "b.jpg", "b.png")
+    found = find_pictures(tmp_path, classes=None)
+    assert [one.path.name for one in found] == ["a.jpg", "b.jpg"]
+    assert [said.partition(" names: ")[2] for said in doubts_of(found)] == ["2 .png"]
+
+
 @pytest.mark.parametrize(("files", "said"), REFUSED)
 def test_labels_that_cannot_be_judged_by_are_refused(tmp_path, files, said):
     """The set was taken for pictures that nobody labelled, for boxes of no size, or each for the next class."""
