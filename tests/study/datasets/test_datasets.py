@@ -207,6 +207,18 @@ def test_what_a_layout_lacks_is_one_sentence(tmp_path, spoil, said):
     assert str(root) in str(caught.value)
 
 
+def test_pictures_that_a_layout_leaves_out_are_said(tmp_path, caplog):
+    """Of 1.jpg and 1.png nobody knew which one was flown over."""
+    write_visdrone(tmp_path, "a")
+    shutil.copytree(tmp_path / A, tmp_path / "still" / "images")
+    for file in tmp_path.rglob("0000003.png"):
+        shutil.copy(file, file.with_suffix(".tif"))
+    for place in (f"visdrone:{tmp_path}", f"still:{tmp_path}/still?labels=none"):
+        caplog.clear()
+        open_dataset(place)
+        assert [one.getMessage().partition(" names: ")[2] for one in caplog.records] == ["1 .tif"]
+
+
 def test_annotations_without_an_object_are_refused(tmp_path):
     """Every box over an empty file of UAVDT was false; of MOTChallenge it was said that classes do not match."""
     root = tmp_path / "root"

@@ -1,5 +1,6 @@
 """A sequence as a folder of numbered images, present and missing ones; and clips without labels."""
 
+import logging
 import re
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Words
@@ -10,13 +11,15 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_edge.source.contract import SourceSettings
-from hvt_edge.source.folder import sequence_files
+from hvt_edge.source.folder import left_out, sequence_files
 from hvt_edge.source.resample import base_frame_count
 from hvt_edge.source.video import VideoSource
 from hvt_study.datasets.label_files import read_image
 from hvt_study.datasets.label_table import TableLabels
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +43,8 @@ class ImageSequence:
             raise UserError(
                 f"sequence folder {self.folder} holds no images: accepted are jpg, png and the like"
             )
+        if said := left_out([self.folder], files, pictures=True):
+            _log.warning("%s: %s", self.folder, said)
         numbers = [_number(file) for file in files]
         for file, number, wanted in zip(
             files, numbers, range(numbers[0], numbers[0] + len(files)), strict=True

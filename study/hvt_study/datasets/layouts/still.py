@@ -5,12 +5,13 @@ ROOT/classes.txt), a folder of pictures with NAME.txt beside NAME.jpg, or a sing
 labels, and boxes that follow exactly; the way is drawn from a seed. See `hvt_study.datasets.virtual_camera`.
 """
 
+import logging
 from collections.abc import Callable, Hashable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_edge.source.folder import sequence_files
+from hvt_edge.source.folder import left_out, sequence_files
 from hvt_study.datasets.label_files import Folders, in_any_case
 from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels
@@ -18,6 +19,8 @@ from hvt_study.datasets.layouts.image_sequence import find_folders
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
+
+_log = logging.getLogger(__name__)
 
 
 def still_labels(
@@ -55,6 +58,8 @@ def _pictures(place: Path) -> list[Path]:
             f"still folder {place} holds no pictures: expected are images/NAME.jpg and annotations/NAME.txt or "
             "labels/NAME.txt, or NAME.jpg and NAME.txt beside it"
         )
+    if said := left_out({file.parent for file in found}, found, pictures=True):
+        _log.warning("%s: %s", place, said)
     return found
 
 
