@@ -46,10 +46,9 @@ get video at the least rate, since behind a router the link may be gone all the 
 _LATE_NS = 3 * SECOND_NS
 """Where all named messages have come late for this long, the path is longer than it was."""
 _QUEUE_NS = SECOND_NS
-"""Where two named in a row came later than this, or one that was given up and that no silence held up, those behind
-them stand in a queue that must empty first, …"""
+"""Where two named in a row came later than this, those behind them stand in a queue that must empty first, …"""
 _STALL_NS = SECOND_NS
-"""… unless none of them has come for this long and twice the time between the last two: they are lost."""
+"""… unless none of them has come for this long: they are lost."""
 _MEMORY_NS = 15 * SECOND_NS
 """What was measured counts for this long."""
 _MOST_RECORDS = 1024
@@ -267,8 +266,6 @@ class Pacer:
         """When the primary receiver reported last; None while there is none."""
         self._progress_ns = 0
         """When it last named a base message in flight."""
-        self._resumed_ns = self._between_ns = 0
-        """When reports came again after a silence; the time between the last two of them that named one."""
         self._held_ns = _FIRST_HELD_NS
         self._round_trip, self._return = LeastDelay(), LeastDelay()
         self.round_trip_ns = SECOND_NS // 2
@@ -382,26 +379,22 @@ class Pacer:
             if report.first:
                 self._forget_path()
                 self._progress_ns = now_ns
-            silent_ns = 0 if self._reported_ns is None else now_ns - self._reported_ns
+            silent = self._reported_ns is not None and now_ns - self._reported_ns > _SILENCE_NS
             self._reported_ns = now_ns
             self._note_losses(feedback, now_ns)
             oldest = self._flight.oldest
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
             given_up = self._given_up
-            if silent_ns > _GIVEN_UP_NS:
-                self._resumed_ns = now_ns
-            if silent_ns > _SILENCE_NS:
+            if silent:
                 self._give_up_all()
             if sent is None:
                 return
-            self._progress_ns, self._between_ns = now_ns, now_ns - max(self._progress_ns, self._resumed_ns)
+            self._progress_ns = now_ns
             return_ns, held_ns = now_ns - feedback.send_ns, 1000 * feedback.base_held_us
             late_back_ns = 0 if self._return.empty else max(0, return_ns - self._return_ns)
             queued_before = self._queued
             self._queued = self._late_ns(sent, now_ns) - held_ns - late_back_ns > _QUEUE_NS
-            if self._queued and (
-                queued_before or (sent.sequence <= given_up and sent.sent_ns > self._resumed_ns)
-            ):
+            if self._queued and queued_before:
                 self._drain_to = self._flight.last_base
             if sent.sequence <= given_up and not self._take_longer(sent, return_ns, now_ns):
                 return
@@ -512,8 +505,7 @@ class Pacer:
 
     def _is_open(self, now_ns: int, most_backlog_ns: int) -> bool:
         due = self._flight.next_due
-        stall_ns = _STALL_NS + 2 * self._between_ns
-        if due is not None and due.sequence <= self._drain_to and now_ns - self._progress_ns <= stall_ns:
+        if due is not None and due.sequence <= self._drain_to and now_ns - self._progress_ns <= _STALL_NS:
             return False
         backlog_ns = self._flight.backlog_ns(now_ns=now_ns, rate_bps=self.rate_bps)
         return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= self._slack_ns
