@@ -102,7 +102,7 @@ def _gaps(files: list[Path]) -> str:
 
 
 def _below(folder: Path) -> str:
-    found = sorted({file.parent.name for file in folder.glob("*/*") if names_picture(file)})
+    found = sorted({file.parent.name for file in folder.glob("[!._]*/*") if names_picture(file)})
     return f" of its own, its folder {found[0]!r:.80} does" if found else ""
 
 

@@ -317,7 +317,7 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     number_of = {
         point: number for number, track in enumerate(tracks) for point in track.iterfind(".//{*}trkpt")
     }
-    times: dict[int, list[float]] = {}
+    placed: dict[int, set[tuple[float, ...]]] = {}
     for number, point in enumerate(points, 1):
         where = f"pose file {path}, point {number}"
         time = point.findtext("{*}time")
@@ -336,10 +336,14 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
         except UserError as error:
             yield error
             continue
-        times.setdefault(number_of.get(point, len(tracks)), []).append(row["utc_s"])
+        placed.setdefault(number_of.get(point, len(tracks)), set()).add(
+            (row["utc_s"], row["latitude_deg"], row["longitude_deg"])
+        )
         yield row
-    # The middle half of each: before a fix receivers say any time.
-    spans = sorted((sorted(one)[len(one) // 4], sorted(one)[-1 - len(one) // 4]) for one in times.values())
+    # Not a single point, nor the copy of a part of another; the middle half: before a fix receivers say any time.
+    several = {frozenset(one) for one in placed.values() if len(one) > 1}
+    ordered = [sorted(one) for one in several if not any(one < other for other in several)]
+    spans = sorted((one[len(one) // 4][0], one[-1 - len(one) // 4][0]) for one in ordered)
     if any(first[1] > second[0] for first, second in pairwise(spans)):
         raise UserError(f"pose file {path} has {len(spans)} tracks of the same time: keep the camera's alone")
     if untimed:

@@ -106,7 +106,7 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
         "mota": tracking.mota,
         "idf1": tracking.idf1,
         "hota": tracking.hota,
-        "id_switches": tracking.switches if tracking.objects else None,
+        "id_switches": None if held.gaps is None else tracking.switches,
         "found_share": held.found_share,
         "gaps": held.gaps,
         "longest_gap_s": None if held.longest_gap is None else held.longest_gap / NOMINAL_FPS,

@@ -68,7 +68,8 @@ def track(seconds, *, elevation="512.4"):
     return f'<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
 
 
-TWO_TRACKS = track([0, 1, 2, 3]).replace("</gpx>", track([0, 1, 2, 3]).partition(">")[2])
+COPIED = track([0, 1, 2, 3]).replace("</gpx>", track([0, 1, 2]).partition(">")[2])
+TWO_TRACKS = COPIED.replace("47.50000", "48.50000", 1)
 ERRORS = f"{PLACE},position_error_m,height_error_m,angle_error_deg\n0,1,2,0.01,0.02,0.05\n"
 COLUMNS = (
     "utc,latitude_deg,longitude_deg,height_m,yaw_deg,pitch_deg,camera_yaw_deg,camera_pitch_deg,hfov_deg,angle_error_deg\n"
@@ -114,6 +115,7 @@ FEET = (
         ("way.gpx", GPX, 5, {"latitude_deg": 47.3774, "altitude_m": 525.5, "height_m": None}),
         ("way.gpx", track(range(4), elevation="68,000"), 0, {"altitude_m": 68.0}),
         ("way.gpx", track(range(4), elevation="NaN"), 0, {"altitude_m": None}),
+        ("way.gpx", COPIED, 0, {"latitude_deg": 47.5}),
         ("rtk.csv", ERRORS, 0, {"position_error_m": 0.01, "height_error_m": 0.02, "angle_error_deg": 0.05}),
         ("own.csv", COLUMNS, 1, {"height_m": 55, "hfov_deg": 60, "angle_error_deg": 0.5}),
         ("own.csv", COLUMNS, 1, {"platform": (15, 0, 0), "camera": (10, -90, 0)}),
