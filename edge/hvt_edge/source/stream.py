@@ -22,9 +22,9 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.source.contract import Notes
 from hvt_edge.source.decoding.container import (
     DEMUX_OPTIONS,
+    Decoder,
     cause_of,
     choose_stream,
-    decode,
     is_local,
     is_picture_each,
 )
@@ -151,17 +151,17 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     # Undecodable packets are left out: joined between keyframes, and not counted, or losses.
     times: dict[Fraction, int] = {}
     damaged: int | None = None
-    until_s, stamped = time.monotonic() + FIRST_S, is_stamped(container)
+    until_s, stamped, decoder = time.monotonic() + FIRST_S, is_stamped(container), Decoder(stream)
     for packet in live_packets_of(container, stream):
         camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
         try:
-            decoded = decode(stream, packet)
+            decoded = decoder.decode(packet)
         except av.error.FFmpegError:
             decoded = []
             damaged = None if damaged is None else damaged + is_picture_each(stream)
-        if any(frame.is_corrupt for frame in decoded):
+        if decoder.patched:
             pictures.say("damaged pictures come, shown as the decoder has patched them")
         if decoded:
             until_s = time.monotonic() + _UNDECODED_S

@@ -64,7 +64,8 @@ _FILE_OPTIONS = {
 _PLAYLIST, _IN_SEGMENTS = ".m3u8", "hls"
 _WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
-_JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
+_MOST_DAMAGED = 8
+"""JPEGs in a row: of a longer row each is shown."""
 _TS_BYTES = (188, 192, 204)
 """Size of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
 
@@ -173,6 +174,8 @@ def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: Non
         note("it holds no film: what is shown is its cover picture")
     moving = [one for one in films if one.codec_context.name not in _PICTURE_CODECS] or films
     chosen = max(moving, key=rank)
+    if is_picture_each(chosen):
+        chosen.codec_context.options = {"err_detect": "explode"}
     if len(able) > 1:
         codec = chosen.codec_context
         note(
@@ -230,11 +233,11 @@ def survey(container: Any, stream: Any, *, name: str) -> tuple[Stamps, av.VideoF
     """The times in the stream's first packets, and its first frame. Raises `UserError` where none decodes there."""
     times: list[tuple[Fraction | None, Fraction | None]] = []
     first: av.VideoFrame | None = None
-    why = ""
+    why, decoder = "", Decoder(stream)
     for packet in packets_of(container, stream):
         if first is None:
             with suppress(av.error.FFmpegError):
-                first = next(iter(decode(stream, packet)), None)
+                first = next(iter(decoder.decode(packet)), None)
         if isinstance(packet, Exception):
             why = f" ({cause_of(packet)})"
             if "://" in name and "mp4" in container.format.name:
@@ -299,10 +302,10 @@ def decoded(
 
 class _Reading:
     def __init__(self, container: Any, stream: Any) -> None:
-        self._container, self._stream = container, stream
+        self._container, self._stream, self._decoder = container, stream, Decoder(stream)
         self._size = _size_of(container)
         self._begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)  # guessed later
-        self.damaged = self._shown_damaged = self._count = self._lossy = 0
+        self.damaged = self._count = self._lossy = 0
         self._ended = ""
         self.end_s: Fraction | None = None
         """End of the film by its time stamps, as far as these go on."""
@@ -324,19 +327,18 @@ class _Reading:
                     end_s = Fraction(stamp + (packet.duration or 0)) * (packet.time_base or 0)
                     self.end_s = max(end_s, self.end_s or end_s)
             try:
-                frames = decode(self._stream, packet)
+                frames = self._decoder.decode(packet)
             except av.error.FFmpegError:
                 self.damaged += 1
                 continue
-            self._shown_damaged += sum(frame.is_corrupt for frame in frames)
             yield from frames
 
     def faults(self) -> Iterator[str]:
         if self.damaged:
             codec = self._stream.codec_context.name
             yield f"has {self.damaged} packets, damaged or of another codec than {codec}, which were skipped"
-        if self._shown_damaged:
-            yield f"has {self._shown_damaged} damaged pictures, shown as the decoder has patched them"
+        if self._decoder.patched:
+            yield f"has {self._decoder.patched} damaged pictures, shown as the decoder has patched them"
         if self._lossy:
             yield f"lacks packets at {self._lossy} pictures: they were lost, or recordings were put together"
         why = self._ended or self._unfinished()
@@ -429,28 +431,37 @@ def is_picture_each(stream: Any) -> bool:
     return str(stream.codec_context.name) == "mjpeg"
 
 
-def decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
-    """The pictures of a packet, of the stream's own codec; after an error those that the decoder has held back.
+class Decoder:
+    """Decodes the packets of one stream; ``patched`` counts the damaged pictures that it gave out.
 
-    Raises `FFmpegError` for a damaged packet.
+    A damaged JPEG is none of these while others are whole: each is a picture of its own, and the one before is seen
+    instead. Where none is whole, as of a camera that breaks the standard in each, they are shown.
     """
-    if isinstance(packet, Exception):
-        return list(stream.codec_context.decode(None))
-    if is_picture_each(stream) and _is_truncated(bytes(packet)):
-        raise av.error.InvalidDataError(1, "it breaks off")
-    return list(packet.decode())
 
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self._damaged_in_a_row = self.patched = 0
 
-def _is_truncated(jpeg: bytes) -> bool:
-    # Whether a JPEG breaks off: FFmpeg would go on with an older picture there.
-    if jpeg.rfind(_JPEG_SCAN) <= jpeg.rfind(_JPEG_END):
-        return False
-    strict = av.CodecContext.create("mjpeg", "r")  # some cameras leave out the mark of its end alone
-    strict.options = {"err_detect": "explode"}
-    try:
-        return not strict.decode(av.Packet(jpeg))
-    except av.error.FFmpegError:
-        return True
+    def decode(self, packet: Any) -> list[av.VideoFrame]:
+        """The pictures of a packet, of the stream's own codec; after an error those that were held back.
+
+        Raises `FFmpegError` for a damaged packet.
+        """
+        if isinstance(packet, Exception):
+            return list(self._stream.codec_context.decode(None))
+        try:
+            frames: list[av.VideoFrame] = list(packet.decode())
+        except av.error.FFmpegError:
+            self._damaged_in_a_row += 1
+            if not is_picture_each(self._stream) or self._damaged_in_a_row <= _MOST_DAMAGED:
+                raise
+            # One that has decoded no other: FFmpeg would go on with an older picture where this one is cut.
+            frames = av.CodecContext.create("mjpeg", "r").decode(packet)
+            self.patched += len(frames)
+        else:
+            self._damaged_in_a_row = 0
+            self.patched += sum(frame.is_corrupt for frame in frames)
+        return frames
 
 
 def _lacks_index(path: Path) -> str:
