@@ -232,6 +232,8 @@ _MOST_BEHIND_NS = 2 * SECOND_NS
 """Delay that has grown beyond this step by step means another length of a second: 25 stamps a second, 24 frames."""
 _MOST_SET_NS = SECOND_NS
 """The same where the stamps go back: the camera's clock was set."""
+_OFTEN = 3
+"""Stamps that fell behind so often do not count for a minute."""
 _PROOF_NS, _NEAR_NS = 10 * SECOND_NS, SECOND_NS // 10
 """Stamps that come this near to the least delay after this time count the same second as we do: …"""
 _HELD_NS = 10 * SECOND_NS
@@ -259,6 +261,8 @@ class CameraClock:
         self._since_ns = self._begun_ns = 0
         """When the present least delay was begun, and when the first for the stamps as they count now."""
         self._proven = False
+        self._fell_behind = self._unused_ns = 0
+        """How often its stamps did, and never caught up; until when they do not count for it."""
         self._late_ns = self._held_ns = self._fell_ns = 0
         """How late the last frame was, the least of those that are held back for long, and when that was found."""
         self._recent: deque[int] = deque(maxlen=_RECENT)
@@ -271,6 +275,9 @@ class CameraClock:
 
     def capture_ns(self, camera_ns: int | None, *, now_ns: int) -> int:
         """The capture time of the frame that has just come; ``camera_ns`` is None where the camera gives none."""
+        if now_ns < self._unused_ns:
+            camera_ns = None
+            self._least.clear()
         taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(camera_ns, now_ns)
         taken_ns = min(taken_ns, now_ns)
         if taken_ns <= self._last_ns:
@@ -298,8 +305,14 @@ class CameraClock:
             return late_ns > _MOST_SET_NS
         if late_ns <= _MOST_BEHIND_NS:
             self._held_ns = 0
-            return late_ns < -_MOST_BEHIND_NS
+            if late_ns < -_MOST_BEHIND_NS:
+                self._fell_behind = 0
+                return True
+            return False
         if self._held_ns == 0 and not leaps:
+            self._fell_behind += 1
+            if self._fell_behind >= _OFTEN:  # no queue that grew: most frames would seem to come too early
+                self._unused_ns = now_ns + _MEMORY_NS
             return True
         if leaps or late_ns < self._held_ns - _NEAR_NS:
             self._held_ns, self._fell_ns = late_ns, now_ns
