@@ -117,7 +117,7 @@ def _ground(units: list[AccessUnit]) -> tuple[float, int]:
         took = time.perf_counter() - began
         searched = session.perceived.detections_run
         session.close()
-        sink.join(time.monotonic() + 10.0)
+        sink.join(10.0)
     return took / len(items), searched
 
 

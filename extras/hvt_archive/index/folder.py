@@ -18,7 +18,7 @@ from hvt_archive.index.retention import Retention, due, in_name
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import Moment, boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
-from hvt_common.runtime.process import lower_priority
+from hvt_common.runtime.process import with_lower_priority
 from hvt_common.units import SECOND_NS
 from hvt_ground.control import EdgeClient
 from hvt_ground.extras import Service
@@ -46,6 +46,9 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
     left, and those of a name of ours that it does not know, are ``unread``: thousands take minutes. A None reads one
     of them, but once a minute it looks. Before that they count as far as their first bytes say whose they are.
 
+    Live video goes before the long jobs, to read a file or to remove its video. Once ``stop`` is set none is waited
+    for, and a later writer does it.
+
     A wall clock may be years off, and be set at any time: ages count the time since the index learned of a file,
     which is that of the boot's own clock (`Index.pass_time`). For its age one file goes at a time.
     """
@@ -58,11 +61,13 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         folder: Path,
         retention: Retention,
         *,
+        stop: threading.Event | None = None,
         now_ns: Callable[[], int] = time.time_ns,
         since_boot: Callable[[], tuple[str, int]] = lambda: (boot_id(), since_boot_ns()),
     ) -> None:
         self._folder = folder
         self._retention = retention
+        self._stop = stop or threading.Event()
         self._now_ns = now_ns
         self._since_boot = since_boot
         self._doubted_ns: int | None = None
@@ -137,7 +142,10 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         with claimed(path) as ours:
             if not ours:
                 return
-            row, found = self._index.row(name), described(path)
+            found = with_lower_priority(partial(described, path), stop=self._stop)
+            if self._stop.is_set():
+                return
+            row = self._index.row(name)
             if found is not None and (row is not None or name.startswith(f"hvt-{found.edge}-")):
                 self._index.put(replace(found, written_ns=now_ns if row is None else row.written_ns))
             elif row is not None and row.session == _UNREAD:
@@ -166,7 +174,9 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         if self._doubted_ns is not None and now.steady_ns - self._doubted_ns < _DOUBT_NS:
             return
         any(self._remove(name, "it is older than --keep allows") for name in found.outdated)
-        any(self._strip(rows[name]) for name in found.strip if self._may_try(name, now))
+        any(
+            self._stop.is_set() or self._strip(rows[name]) for name in found.strip if self._may_try(name, now)
+        )
 
     def _may_try(self, name: str, now: Moment) -> bool:
         # A file of which nothing can be read takes seconds each time; room on the disk may come back.
@@ -181,7 +191,8 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
 
     def _strip(self, row: RecordingRow) -> bool:
         path = self._folder / row.file
-        if not self._done(row.file, "stripped of its video", partial(remove_video, path)):
+        strip = partial(self._done, row.file, "stripped of its video", partial(remove_video, path))
+        if not with_lower_priority(strip, stop=self._stop):
             return False
         self._index.change(row.file, size_bytes=path.stat().st_size, video=False)
         _log.warning("the video of recording %s is removed: it is older than --keep-video", row.file)
@@ -222,8 +233,7 @@ class RecordingsFolder(Service):
         )
 
     def _opened(self) -> IndexWriter:
-        lower_priority()  # with the programs that read files and remove video: live video goes before them
-        self._writer = IndexWriter(self._folder, self._retention)
+        self._writer = IndexWriter(self._folder, self._retention, stop=self._stop)
         if self._clock.ident is None:
             self._clock.start()
         return self._writer
@@ -233,12 +243,12 @@ class RecordingsFolder(Service):
             self._sink.log(row)
 
     def __exit__(self, *_: object) -> None:
-        """Write the queue, within a few seconds."""
+        """Write the queue."""
         self._stop.set()
         if self._sink is not None:
             if self._clock.ident is not None:
                 self._clock.join()
-            self._sink.join(time.monotonic() + _END_S)
+            self._sink.join(_END_S)
 
     def _poll(self) -> None:
         # Files grow old while nobody flies, too.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -75,8 +74,7 @@ class _Logging(Service):
 
     def __exit__(self, *_: object) -> None:
         if self._sink is not None:
-            self._sink.close()
-            self._sink.join(time.monotonic() + _END_S)
+            self._sink.join(_END_S)
 
     def _open(self) -> MessageLog:
         from hvt_archive.replay.message_log import MessageLog  # noqa: PLC0415

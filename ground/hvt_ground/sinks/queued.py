@@ -17,6 +17,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from hvt_common.errors import UserError, foreign
 from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
+from hvt_common.runtime.process import joined
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Overlay, Refinement, VideoSample
@@ -152,14 +153,9 @@ class QueuedSink(Generic[T]):
             self._ending = True
             self._changed.notify_all()
 
-    def join(self, deadline_s: float) -> bool:
-        """Wait for the end until ``deadline_s`` (monotonic), then for a second more without slow extras."""
-        self.close()
-        self._thread.join(max(0.0, deadline_s - time.monotonic()))
-        self._hurry.set()
-        self._thread.join(1.0)
-        if not self.ended:
-            self._fail(UserError("it did not end in time, and what it had yet to write is lost"))
+    def join(self, within_s: float) -> bool:
+        """Wait for the end (`joined`), then for a second more without slow extras."""
+        _join([self], within_s)
         return self.ended
 
     @property
@@ -304,6 +300,20 @@ class QueuedSink(Generic[T]):
         self._failed = self._failures.failed(self.part, reason_of(error), last=self._ending)
 
 
+def _join(sinks: Sequence[QueuedSink[Any]], within_s: float) -> None:
+    for one in sinks:
+        one.close()
+    threads = [one._thread for one in sinks]  # noqa: SLF001 - of this module
+    if joined(*threads, within_s=within_s):
+        return
+    for one in sinks:
+        one._hurry.set()  # noqa: SLF001
+    joined(*threads, within_s=1.0)
+    for one in sinks:
+        if not one.ended:
+            one._fail(UserError("it did not end in time, and what it had yet to write is lost"))  # noqa: SLF001
+
+
 def is_stored(item: object) -> bool:
     """Whether an edge has stored it and forgets it when it is acknowledged."""
     return isinstance(item, VideoSample | Refinement) and item.stored
@@ -384,11 +394,7 @@ class Outputs:
         return {part: late_s for late_s, part in late if late_s >= BEHIND_S}
 
     def close(self, *, within_s: float = 8.0) -> None:
-        """End them all, within that time."""
+        """End them all, as `QueuedSink.join` does."""
         with self._lock:
             sinks = list(self._sinks)
-        for sink in sinks:
-            sink.close()
-        deadline_s = time.monotonic() + within_s
-        for sink in sinks:
-            sink.join(deadline_s)
+        _join(sinks, within_s)

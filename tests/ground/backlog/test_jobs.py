@@ -235,7 +235,7 @@ def test_a_ground_that_runs_for_months_takes_former_sessions_every_day(tmp_path)
         assert backlog is not None
     recordings.close()
     for one in made:
-        one.join(time.monotonic() + 60)
+        one.join(60)
 
 
 def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):

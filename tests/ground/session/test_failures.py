@@ -224,9 +224,7 @@ def test_a_session_that_fails_ends_alone_and_begins_anew(flight, tmp_path, caplo
         f"session of uav-1: {CAUSES[cause]}; all else goes on, and it is tried again"
     ]
     sinks = [one.sinks for one in consumer.sessions if one.info.session_id == flight.session_id]
-    assert all(
-        one.join(time.monotonic() + 60) for both in sinks for one in both if isinstance(one, QueuedSink)
-    )
+    assert all(one.join(60) for both in sinks for one in both if isinstance(one, QueuedSink))
     first, second = (
         completed(one, rig.sessions, sinks=written) for one, written in zip(rig.summaries, sinks, strict=True)
     )

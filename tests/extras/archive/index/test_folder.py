@@ -236,21 +236,28 @@ def test_a_disk_that_is_unmounted_and_comes_back_has_its_index(copied):
 
 
 def test_a_ground_that_ends_while_it_reads_many_files_leaves_them_to_the_next(copied, monkeypatch):
-    """It said that what it had yet to write was lost; and live video waited for the reading of old files."""
+    """It said that what it had yet to write was lost; and live video waited for the reading of old files.
+
+    One large file, or one on a busy machine, took the rows of the flight that had come meanwhile with it.
+    """
+    (row, _), ended = read_index(copied), threading.Event()
     (copied / INDEX).unlink()
     read, failures = [], Failures(time.time_ns)
 
     def described(path: Path) -> RecordingRow | None:
         read.append((path.name, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
-        index._stop.wait(60)  # noqa: SLF001 - until it ends
+        ended.wait()
         return files.described(path)
 
     monkeypatch.setattr(folder, "described", described)
     with RecordingsFolder(copied, ALL, failures=failures) as index:
         index.begin()
         eventually(lambda: read, what="it reads")
+        index.recorded(replace(row, file="flown.rrd"))
+    ended.set()
     assert ([name for name, _ in read], failures.parts) == (NAMES[1:], ())
     assert read[0][1] >= 10
+    assert "flown.rrd" in [one.file for one in read_index(copied)]
     monkeypatch.undo()
     assert [(one.file, one.frames) for one in look(copied)] == [(name, 30) for name in NAMES]
 

@@ -135,7 +135,7 @@ def sink_of(url: str, environment: dict[str, str] | None = None) -> tuple[Queued
 
 
 def ended(sink: QueuedSink[CotMessage]) -> bool:
-    return sink.join(time.monotonic() + PATIENT_S)
+    return sink.join(PATIENT_S)
 
 
 @pytest.fixture
