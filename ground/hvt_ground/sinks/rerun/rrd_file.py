@@ -4,7 +4,7 @@ Rerun stores chunks: a table of rows of one entity. A chunk costs about 1.3 kB b
 of a kB for each further column, as much as half an access unit at 300 kbps; so rows must be gathered. A recording
 that gathers rows in memory loses them when the process is killed. `RrdFile` does both: each row is
 appended at once as a chunk of its own (the *append log*, at the end of the file), and when the append log's rows have
-become ``compact_bytes``, the same rows are written again as one chunk a table, over the append log (*compaction*).
+become ``compact_bytes``, the same rows are written again as few chunks, over the append log (*compaction*).
 
 While it grows the file is a plain RRD stream without a footer: the SDK keeps a footer's table, a row for each chunk,
 in memory for as long as it records. At the end the SDK writes the compacted chunks once more, with a footer.
@@ -283,7 +283,10 @@ class RecordingFile:
             self._output.close(hurry)
 
     def _compact(self) -> None:
-        chunks = [*self._contexts.values(), *(table.take() for table in self._tables.values() if table)]
+        chunks = [
+            *self._contexts.values(),
+            *(chunk for table in self._tables.values() for chunk in table.take()),
+        ]
         self._contexts.clear()
         self._pending_bytes = 0
         if chunks:
@@ -292,8 +295,8 @@ class RecordingFile:
     def _add(self, row: TableRow) -> Chunk:
         assert row.at is not None, "a row has its time"
         table = self._tables.setdefault((row.path, row.columns), Table(row.path, row.columns))
-        if not table:
-            self._size_limit.logged_bytes += TABLE_BYTES
+        before = table.chunk_count
+        chunk = table.add(*row.at, row.value, size_bytes=row.size_bytes)
         self._pending_bytes += row.size_bytes
-        self._size_limit.logged_bytes += row.size_bytes
-        return table.add(*row.at, row.value)
+        self._size_limit.logged_bytes += row.size_bytes + TABLE_BYTES * (table.chunk_count - before)
+        return chunk

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import accumulate, chain, groupby
 from operator import itemgetter
 from typing import Any
 
@@ -21,7 +21,9 @@ _LATEST_NS = 2**63 - 1
 FIXED_BYTES = 77_000
 """About the cost of the blueprint and the static values."""
 TABLE_BYTES = 2_000
-"""About the cost of a table in each compaction before its first row: a chunk and its columns."""
+"""About the cost of a chunk before its first row."""
+_CHUNK_BYTES = 2**17
+"""A table's chunks are about as large at most: where a file breaks off, all of the last one is lost."""
 _HEAD_START_BYTES = 30_000
 """Beyond the ratio, so that the first pictures of a flight are shown."""
 
@@ -95,28 +97,36 @@ class Table:
 
     path: str
     columns: str
-    _rows: list[tuple[int, int, Any]] = field(default_factory=list)
+    _rows: list[tuple[int, int, Any, int]] = field(default_factory=list)
+    _bytes: int = 0
 
-    def add(self, frame: int, capture_ns: int, value: Any) -> Chunk:
+    def add(self, frame: int, capture_ns: int, value: Any, *, size_bytes: int) -> Chunk:
         """Gather a row; returns it as a chunk of its own, for the append log.
 
         Times come from the wire: one beyond the range of timestamps becomes the nearest that can be held.
         """
-        row = frame, min(max(capture_ns, 0), _LATEST_NS), value
+        row = frame, min(max(capture_ns, 0), _LATEST_NS), value, size_bytes
         self._rows.append(row)
+        self._bytes += size_bytes
         return self._chunk([row])
 
-    def __bool__(self) -> bool:
-        """Whether there are rows since the last `take`."""
-        return bool(self._rows)
+    @property
+    def chunk_count(self) -> int:
+        """Number of chunks that `take` would give."""
+        return bool(self._rows) + self._bytes // _CHUNK_BYTES
 
-    def take(self) -> Chunk:
-        """All rows since the last call as one chunk; there must be some. Those of a backlog have come late."""
-        rows, self._rows = sorted(self._rows, key=itemgetter(0)), []
-        return self._chunk(rows)
+    def take(self) -> list[Chunk]:
+        """All rows since the last call as chunks. Those of a backlog have come late."""
+        rows = sorted(self._rows, key=itemgetter(0))
+        ends = zip(accumulate(size_bytes for *_, size_bytes in rows), rows, strict=True)
+        self._rows, self._bytes = [], 0
+        return [
+            self._chunk([row for _, row in some])
+            for _, some in groupby(ends, lambda one: one[0] // _CHUNK_BYTES)
+        ]
 
-    def _chunk(self, rows: Sequence[tuple[int, int, Any]]) -> Chunk:
-        frames, capture_ns, values = zip(*rows, strict=True)
+    def _chunk(self, rows: Sequence[tuple[int, int, Any, int]]) -> Chunk:
+        frames, capture_ns, values, _ = zip(*rows, strict=True)
         indexes = [
             rr.TimeColumn("frame", sequence=frames),
             rr.TimeColumn("capture_time", timestamp=np.array(capture_ns, "datetime64[ns]")),

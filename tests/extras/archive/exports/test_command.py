@@ -319,6 +319,17 @@ def test_a_recording_that_breaks_off_is_exported_so_far(recording, tmp_path, los
     assert len(shown(export(cut, tmp_path / "cut.mp4"))) > FRAMES / 2
 
 
+def test_of_half_a_finished_recording_nearly_half_is_exported(tmp_path):
+    """A copy that was broken off had no picture where a flight was short: its video was one chunk."""
+    noise = np.random.default_rng(0).integers(0, 255, (FRAMES, SIZE[1], SIZE[0], 3), np.uint8)
+    path, units = tmp_path / "flight.rrd", coded(list(noise), kbps=4000, keyint=20)
+    with Recorder(settings(path)) as recorder:
+        for frame, (unit, _) in enumerate(units):
+            recorder.log(VideoSample(frame, START_NS + frame * STEP_NS, unit, keyframe=frame % 20 == 0))
+    os.truncate(path, path.stat().st_size // 2)
+    assert len(shown(export(path, tmp_path / "cut.mp4"))) > FRAMES / 5
+
+
 @pytest.mark.parametrize(
     "damage", [lambda data: data[:-3000] + bytes(3000), lambda data: damaged(data, b"Boxes2D:half_sizes")]
 )
