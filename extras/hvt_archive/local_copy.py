@@ -21,6 +21,7 @@ import av.error
 
 from hvt_common.files import check_there
 from hvt_common.runtime.failures import Failures, RetryPause, Turns
+from hvt_common.runtime.process import joined
 from hvt_common.values import AccessUnit
 
 _log = logging.getLogger(__name__)
@@ -66,8 +67,7 @@ class LocalCopy:
         """Write the queue and the index, and end the thread; a card that hangs is left behind."""
         with contextlib.suppress(queue.Full):
             self._queue.put(None, timeout=_CLOSE_S)
-        self._thread.join(_CLOSE_S)
-        if self._thread.is_alive():
+        if not joined(self._thread, within_s=_CLOSE_S):
             self._failures.failed(_PART, f"{self._path} did not take the last frames within {_CLOSE_S:g} s")
 
     def __enter__(self) -> Self:

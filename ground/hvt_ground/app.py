@@ -136,6 +136,8 @@ class Ground:
         models = self._models = Models(self._config)
         try:
             self._fly(models)
+            if not all(one.finished for one in (*self._edges.values(), *self._leaving)):
+                raise self.given_up()
         except FlightError as error:
             error.summary = self._summaries(models)
             raise

@@ -21,6 +21,7 @@ from hvt_ground import app
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import Extra, Service
+from hvt_ground.session.edge_sessions import EdgeSessions
 from programs.outsider import joined
 from programs.processes import eventually
 
@@ -256,6 +257,27 @@ def test_a_group_learns_of_the_page_whatever_else_is_served(
             assert pages == [b"https://base-a.example/"]
     finally:
         run.stop.set()
+
+
+def test_a_session_that_hangs_at_the_end_is_said(
+    free_port: int, tmp_path: Path, service, monkeypatch
+) -> None:
+    """Its flight was in no summary, and the ground ended with 0 as if all were well."""
+    states, hung = list[Any](), threading.Event()
+    service.show = states.append
+    monkeypatch.setattr(EdgeSessions, "close", lambda _: hung.wait())
+    monkeypatch.setattr(EdgeSessions, "join", EdgeSessions.stop)
+    run = Run(config(free_port, tmp_path))
+    try:
+        with joined(f"tcp/127.0.0.1:{free_port}") as outsider, outsider.liveliness().declare_token(ALIVE):
+            eventually(lambda: states and states[-1].edges, what="the edge is served")
+            run.stop.set()
+            run.wait()
+    finally:
+        run.stop.set()
+        hung.set()
+    assert isinstance(run.error, FlightError)
+    assert str(run.error).startswith("it was stopped, and something in it hangs")
 
 
 class Failing(threading.Event):

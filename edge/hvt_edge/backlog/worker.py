@@ -28,7 +28,7 @@ from hvt_common.protocol.messages import (
     pack_backlog_still,
 )
 from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
-from hvt_common.runtime.process import in_thread, lower_priority
+from hvt_common.runtime.process import in_thread, joined, lower_priority
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
@@ -305,8 +305,7 @@ class StoreWorker:
     def close(self) -> None:
         """Write the queue, close the file, join the thread. A disk that hangs costs the queue, and a warning."""
         self.intake.signal(closed=True)
-        self._thread.join(timeout=self._close_s)
-        if self._thread.is_alive():
+        if not joined(self._thread, within_s=self._close_s):
             _log.warning(
                 "the disk of --store-folder takes longer than %g s: %d frames and stills that wait for it are not "
                 "stored",

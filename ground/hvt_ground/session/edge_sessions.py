@@ -28,6 +28,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, Turns, reason_of
 from hvt_common.runtime.log import log_fields
+from hvt_common.runtime.process import joined
 from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import BacklogRecordings, EdgeBacklog
@@ -129,10 +130,9 @@ class EdgeSessions:
             self.port.inbox.close()
 
     def join(self, *, timeout_s: float = 4.0) -> bool:
-        """Finish arrived messages, close the session, join the thread; False where that took too long."""
+        """Finish arrived messages, close the session, join the thread (`joined`); False where that hangs."""
         self.stop()
-        self._thread.join(timeout_s)
-        return self.finished
+        return joined(self._thread, within_s=timeout_s)
 
     @property
     def finished(self) -> bool:
