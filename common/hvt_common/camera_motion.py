@@ -87,6 +87,15 @@ _RANSAC_PX: Final = 1.0
 # Fewer corners that agree than this, or a smaller share of them, is chance: objects, noise, an empty sky.
 _LEAST_INLIERS: Final = 12
 _LEAST_INLIER_SHARE: Final = 0.3
+_STIR_PX: Final = 1.0
+"""In the reduced picture: a smaller motion is taken as it is, and the camera stands."""
+_BLOCKS: Final = (16, 9)
+_BLOCK_LEVELS: Final = 2.0
+_BLOCK_SHARE: Final = 0.85
+"""A block speaks for the motion that leaves this share of the other's difference, and that is at least the levels."""
+_LEAST_BLOCKS: Final = 3
+_STANDING_BIAS: Final = 3.0
+"""A camera that stood needs so many blocks for each that says it still does: it passes for one in traffic."""
 # No camera zooms or rolls this far between two frames: such an estimate is wrong.
 _SCALE_RANGE: Final = (0.5, 2.0)
 _STILL_SHIFT: Final = 0.03
@@ -127,10 +136,10 @@ class CameraMotion:
 
     def shift(self) -> float:
         """The shift from the marked image to the newest, as a share of the sides: how much came into view."""
-        height, width = (1, 1) if self._previous is None else self._previous.shape
-        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
-        moved = np.abs(corners @ self._since[:2].T - corners[:, :2]).max(axis=0) / (width, height)
-        return float(moved.sum())
+        if self._previous is None:
+            return 0.0
+        height, width = self._previous.shape
+        return float((_ways(self._since[:2], self._previous) / (width, height)).sum())
 
     def step(self, image: Image) -> Affine:
         """The map from the image of the last call to this one, (2, 3) float64 in pixels of the full image.
@@ -155,6 +164,12 @@ class CameraMotion:
         self.new_scene = other and estimate is None
         if estimate is None or not _plausible(estimate):
             return np.eye(2, 3)
+        if _ways(estimate, current).max() <= _STIR_PX:
+            self._stands = True
+        else:
+            self._stands = _stands(previous, current, estimate, stood=self._stands)
+            if self._stands:
+                return np.eye(2, 3)
         self._since = np.vstack((estimate, [0.0, 0.0, 1.0])) @ self._since
         return _at_full_size(estimate, full_size=full_size, small_size=small_size)
 
@@ -162,6 +177,7 @@ class CameraMotion:
         """Forget the last image: the next call gives the identity."""
         self._previous = None
         self._scene = SceneChange()
+        self._stands = False
         self.new_scene = False
         """Whether the newest image shows another scene than the one before."""
         self.mark()
@@ -196,6 +212,26 @@ def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
     if agreeing < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * np.count_nonzero(tracked)):
         return None
     return np.asarray(affine, np.float64)
+
+
+def _ways(affine: Affine, image: _Gray) -> npt.NDArray[np.float64]:
+    # (2,) the longest ways of the image's corners along x and y.
+    height, width = image.shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
+    return np.asarray(np.abs(corners @ affine.T - corners[:, :2]).max(axis=0), np.float64)
+
+
+def _stands(previous: _Gray, current: _Gray, estimate: Affine, *, stood: bool) -> bool:
+    # A car that passes a camera on a plain road has most of the corners, and the estimate is its motion. The ground
+    # has the larger area: each block of the picture speaks for the estimate or for a camera that stands.
+    moved = cv2.warpAffine(previous, estimate, current.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    by_motion, at_rest = (
+        cv2.resize(cv2.absdiff(one, current).astype(np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
+        for one in (moved, previous)
+    )
+    moves = np.count_nonzero((by_motion < _BLOCK_SHARE * at_rest) & (at_rest > _BLOCK_LEVELS))
+    stands = np.count_nonzero((at_rest < _BLOCK_SHARE * by_motion) & (by_motion > _BLOCK_LEVELS))
+    return bool(stands >= _LEAST_BLOCKS and (_STANDING_BIAS if stood else 1.0) * stands > moves)
 
 
 def _plausible(affine: Affine) -> bool:

@@ -89,6 +89,33 @@ def test_moving_objects_do_not_pull_the_estimate(ground):
     assert worst_corner_px(estimate, between(*cameras)) < 0.5
 
 
+def test_a_vehicle_that_fills_a_standing_picture_does_not_move_the_camera():
+    """Its corners are most of those on a plain road: boxes and parked cars would drive off with it."""
+    rng, motion = np.random.default_rng(6), CameraMotion(scale=None)
+    road = cv2.GaussianBlur(rng.normal(110, 30, (360, 640)).astype(np.float32), (0, 0), 2)
+    road[:, [30, 31, 600, 601]] = 220  # lane marks
+    car = cv2.resize(rng.integers(0, 255, (10, 9)).astype(np.float32), (220, 240))
+    for k in range(8):
+        image = road + rng.normal(0, 2, road.shape)
+        image[40 + 9 * k : 280 + 9 * k, 200:420] = car
+        estimate = motion.step(np.clip(image, 0, 255).astype(np.uint8))
+        np.testing.assert_array_equal(estimate, np.eye(2, 3))
+
+
+@pytest.mark.realdata
+def test_a_camera_that_hovered_and_turns_is_followed_at_once(ground):
+    """Its standing letters, or that it stood until now, would leave every box behind."""
+    rng, motion = np.random.default_rng(3), CameraMotion(scale=None)
+    cameras = [view(500 + 9 * max(0, k - 3), 300, 1.0, 0.0) for k in range(8)]
+    for k, camera in enumerate(cameras):
+        image = shot(ground, camera, rng)
+        for line in range(4):
+            cv2.putText(image, "ALT 120 m  SPD 9", (8, 20 + 16 * line), 0, 0.5, (255, 255, 255))
+        estimate = motion.step(image)
+        if k:
+            assert worst_corner_px(estimate, between(cameras[k - 1], camera)) < 1
+
+
 def test_without_texture_or_in_another_scene_the_camera_stands_still():
     """Every track would jump at a cut, over water, or at the first picture of another size."""
     rng = np.random.default_rng(0)

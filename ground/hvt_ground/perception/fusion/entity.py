@@ -95,14 +95,14 @@ MISSED_STEPS = 2
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A box reported by the edge or a still at one frame, and the object's own motion beyond the camera's."""
+    """A box reported by the edge or a still at one frame, and how the object moves."""
 
     box: _Floats
     """(4,) float64 x1 y1 x2 y2, base pixels."""
     frame_index: int
     confidence: float
-    velocity: _Floats = field(default_factory=lambda: np.zeros(2))
-    """(2,) float64, base pixels a frame."""
+    ways: _Floats = field(default_factory=lambda: np.zeros(4))
+    """(4,) float64, its sides' own motion beyond the camera's, base pixels a frame: x1 y1 x2 y2."""
     steps: int = 1
     """Number of observations."""
 
@@ -110,14 +110,21 @@ class Observation:
         """The same object at a later frame."""
         frames = frame_index - self.frame_index
         stood = path.carry(self.box[None], start=self.frame_index, end=frame_index)[0]
-        newest = (_centre(box) - _centre(stood)) / max(1, frames)
         share = 1.0 if self.steps == 1 else _NEW_VELOCITY
-        velocity = share * newest + (1 - share) * self.velocity
-        return Observation(box, frame_index, confidence, velocity, self.steps + 1)
+        ways = share * (box - stood) / max(1, frames) + (1 - share) * self.ways
+        return Observation(box, frame_index, confidence, ways, self.steps + 1)
+
+    @property
+    def velocity(self) -> _Floats:
+        """(2,) of its centre, base pixels a frame."""
+        return (self.ways[:2] + self.ways[2:]) / 2
 
     def stays(self, frames: int) -> bool:
-        """Whether the object is known to go less than half of its own size in so many frames."""
-        way = frames * float(np.abs(self.velocity).max())
+        """Whether the object is known to go less than half of its own size in so many frames.
+
+        Of one that leaves the picture only the inner side moves.
+        """
+        way = frames * float(np.abs(self.ways).max())
         return self.steps > 1 and way < float((self.box[2:] - self.box[:2]).max()) / 2
 
 
@@ -195,10 +202,6 @@ class Entity:
         """Forget our track, which is another object."""
         self.own_id, self.own_vote = None, Vote()
         self.apart, self.own_then, self.correction = 0, None, None
-
-
-def _centre(box: _Floats) -> _Floats:
-    return (box[:2] + box[2:]) / 2
 
 
 NEAR_IOU = 0.1
