@@ -289,7 +289,7 @@ def _table_row(line: Mapping[str, str | None], where: str) -> _Values:
 
 
 def _points(text: str, path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
-    # Of a track, else of a route, else waypoints; of a file that breaks off those that are whole. And whole tracks.
+    # Of a track, else of a route, else waypoints; of a file that breaks off those that are whole. And whole segments.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"pose file {path} declares a document type, which no GPS track has")
     points: dict[str, list[ET.Element]] = {}
@@ -308,15 +308,13 @@ def _points(text: str, path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
         raise UserError(f"pose file {path} is no GPX: {broken}")
     if broken:
         _log.warning("pose file %s breaks off after %d points: %s", path, len(found), broken)
-    return found, points.get("trk", [])
+    return found, points.get("trkseg", [])
 
 
 def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     untimed = 0
     points, tracks = _points(text, path)
-    number_of = {
-        point: number for number, track in enumerate(tracks) for point in track.iterfind(".//{*}trkpt")
-    }
+    number_of = {point: number for number, track in enumerate(tracks) for point in track.iterfind("{*}trkpt")}
     placed: dict[int, set[tuple[float, ...]]] = {}
     for number, point in enumerate(points, 1):
         where = f"pose file {path}, point {number}"
@@ -345,7 +343,9 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     ordered = [sorted(one) for one in several if not any(one < other for other in several)]
     spans = sorted((one[len(one) // 4][0], one[-1 - len(one) // 4][0]) for one in ordered)
     if any(first[1] > second[0] for first, second in pairwise(spans)):
-        raise UserError(f"pose file {path} has {len(spans)} tracks of the same time: keep the camera's alone")
+        raise UserError(
+            f"pose file {path} has {len(spans)} tracks or segments of the same time: keep the camera's alone"
+        )
     if untimed:
         _log.warning("pose file %s: %d points have no time, and are left out", path, untimed)
 

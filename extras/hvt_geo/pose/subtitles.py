@@ -14,10 +14,12 @@ _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->"
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
 _SIDE = r"(?i:([EWNS]|east|west|north|south))"
 _BEHIND = rf"\s?(?:°|deg)?\s?{_SIDE}\b(?!\s*:)"
+_MORE = r"[ \t°º]{0,3}(?:deg(?:rees?)?\b[ \t]?)?([^\W\d_]\w*+(?!\s{0,4}[:(]))"
+"""A word, but for the name of the next value."""
 _LATLON = r"(?i:l(?:at|ongt?)itude)\s{0,4}[:(]"
 _NAMED = re.compile(
     rf"\b(?!{_LATLON}\s*[+-]?\d++(?:[ :]\d|[.,]\d++\.\d))"
-    rf"([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}(?:{_BEHIND})?"
+    rf"([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}(?:{_BEHIND})?(?:{_MORE})?"
 )
 """But for latitudes and longitudes of 47 06.1, 47:06:01 or 47.06.01, whose degrees alone are another place."""
 _DEGREES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER})(?:{_BEHIND}|(?:\s?deg\b)?(?!\s+[\d+-]))")
@@ -76,7 +78,8 @@ def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[st
         note(sentence)
     if unread:
         note(
-            f"{unread} of its {len(blocks)} blocks have a place that is not understood: accepted are decimal degrees"
+            f"{unread} of its {len(blocks)} blocks have a place that is not understood: accepted are decimal "
+            "degrees, N, S, E or W behind them"
         )
     if unplaced:
         note(f"{unplaced} of its {len(blocks)} blocks have no place, as before there is a fix")
@@ -92,12 +95,12 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
         if len(values) == 3:
             angle_names = (f"{prefix}pitch_deg", f"{prefix}roll_deg", f"{prefix}yaw_deg")
             row |= dict(zip(angle_names, values, strict=True))
-    for name, said, feet, letter in _NAMED.findall(body):
-        if name.lower() in _DJI:
+    for name, said, feet, letter, more in _NAMED.findall(body):
+        column = _DJI.get(name.lower(), "")
+        if column and not (more and column in _NEGATIVE):  # of 33.25 Süd, and of 8.5 West wind
             least, parts = _IN_PARTS.get(name.lower(), (0, 1))
             value = _value(said, feet=feet)
             value = value / parts if said.isdecimal() and value > least else value
-            column = _DJI[name.lower()]
             row[column] = -abs(value) if letter[:1].upper() == _NEGATIVE.get(column) else value
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
