@@ -106,8 +106,20 @@ def _below(folder: Path) -> str:
     return f" of its own, its folder {found[0]!r:.80} does" if found else ""
 
 
+def _bands(files: list[Path]) -> Counter[str]:
+    # Cameras of several bands number these behind a picture's number: IMG_0001_1 to IMG_0001_5. Of other names none.
+    parts = [re.fullmatch(r"(.*[0-9])_([0-9])", file.stem) for file in files]
+    pairs = [(one[1], one[2]) for one in parts if one]
+    counts = Counter(band for _, band in pairs)
+    each = len({picture for picture, _ in pairs})
+    whole = len(pairs) == len(files) and set(counts.values()) == {each} and each > len(counts)
+    return Counter({f"{re.sub(r'[0-9]+', '#', pairs[0][0])}_{band}": each for band in counts if whole})
+
+
 def _series(files: list[Path]) -> str:
     counts = Counter(re.sub(r"[0-9]+", "#", file.stem) for file in files)
+    if len(counts) == 1 and (bands := _bands(files)):
+        counts = bands
     series = sorted((name, count) for name, count in counts.items() if count > 1)
     if not 1 < len(series) <= _MOST_SERIES:
         return ""

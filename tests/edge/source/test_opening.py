@@ -222,6 +222,16 @@ def test_each_of_a_drones_series_is_said_by_its_whole_name(tmp_path):
     assert all(f"2 '#_{band}'" in said for band in bands)
 
 
+@pytest.mark.parametrize(("pictures", "bands", "said"), [(6, 5, "6 'IMG_#_1', 6 'IMG_#_2'"), (2, 9, "")])
+def test_bands_that_are_numbered_are_said(tmp_path, pictures, bands, said):
+    """A camera's five bands in turn were one film without a word; two clips of nine pictures are none."""
+    for number in range(pictures):
+        write_pictures(tmp_path, f"IMG_{number:04}_{{}}.png", range(1, bands + 1))
+    notes = " ".join(play(tmp_path)[0].notes)
+    assert said in notes
+    assert ("several series" in notes) == bool(said)
+
+
 @pytest.mark.parametrize(
     ("shown", "size", "other"), [(".png", 1, ".tiff"), (".tif", 2, ".jpg"), (".jpg", 1, ".png")]
 )
