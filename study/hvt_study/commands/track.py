@@ -1,6 +1,7 @@
 """``hvt-study track``: the tracker alone, over a file of detections, to compare it with others."""
 
 import argparse
+import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -15,7 +16,11 @@ from hvt_common.values import Detections, Tracks
 from hvt_study.datasets.annotation_rows import LAST_FRAME, Rows, read_rows
 from hvt_study.datasets.labels import check_pixels
 
+_log = logging.getLogger(__name__)
+
 _MOT = "frame,id,x,y,w,h,score"
+_FEW = 8
+"""Boxes of which some lie right of the picture's middle."""
 _REMEMBERED = 3
 """Frames without detections after which the tracker, where it tracks nothing, is as after any more of them."""
 
@@ -30,6 +35,11 @@ def read_detections(path: Path) -> Rows:
     score, ids = rows["score"], rows["id"]
     rows.only((score >= 0) & (score <= 1), accepted="a score from 0 to 1 in column 7")
     check_pixels(path, [rows[side] for side in "xywh"])
+    if len(rows) >= _FEW and ((rows["w"] > rows["x"]) & (rows["h"] > rows["y"])).all():
+        _log.warning(
+            "%s: each w is larger than its x, and each h than its y: are they corners, x1,y1,x2,y2? Accepted is %s",
+            *(path, _MOT),
+        )
     if len(rows):
         with_id = ids[0] >= 0
         rows.only(

@@ -53,6 +53,18 @@ def test_upstream_is_reproduced_from_file_to_file(data, tmp_path, capsys):
     np.testing.assert_allclose(ours[:, 2:7], theirs[:, 2:7], atol=1e-3)
 
 
+@pytest.mark.parametrize("corners", [False, True])
+def test_corners_in_place_of_sizes_are_told_of(tmp_path, caplog, corners):
+    """Boxes that reach over the whole picture were tracked without a word."""
+    lines = [
+        f"{frame},-1,{x},{y},{x + 20 if corners else 20},{y + 30 if corners else 30},0.9\n"
+        for frame in range(1, 5)
+        for x, y in ((10, 300), (200, 15))
+    ]
+    read_detections(write(tmp_path / "det.txt", lines))
+    assert ("are they corners, x1,y1,x2,y2? Accepted is frame,id,x,y,w,h,score" in caplog.text) == corners
+
+
 def test_frames_without_detections_are_stepped(tmp_path):
     """A track hidden for longer than the buffer would come back with its old id, or a short gap would end it."""
     out = tmp_path / "out.txt"
