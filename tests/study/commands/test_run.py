@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,22 @@ from studies.small_study import REGIME, SIZE, arguments, detector, entries, flig
 EVERYWHERE = """duration_s total_bps base_bps roi_bps track_bps fps stills map_50 mota hota idf1 top1 top1_all
 macro_f1 recall f1 delay_p95_ms id_switches"""
 METHODS = ("--methods", "M0,M5,DDS", "--regimes", REGIME)
+
+
+class _Here(ThreadPoolExecutor):
+    """This process: one of the study loads all packages anew, and test_compare.py and test_stop.py fly in such."""
+
+    _processes = None
+
+    def __init__(self, *_, **__):
+        super().__init__(1)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _in_this_process():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hvt_study.matrix.pools._Processes", _Here)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,10 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pool(data, tmp_path_factory):
-    """What `fill_real` makes of them, by name."""
-    files = fill_real(tmp_path_factory.mktemp("pool"), data)
+    """What `fill_real` makes of them, by name; x265 codes one picture of each view in place of six."""
+    with pytest.MonkeyPatch.context() as short:
+        short.setattr("hvt_train.pictures.pool._CODED_FRAMES", 1)
+        files = fill_real(tmp_path_factory.mktemp("pool"), data)
     return {path.stem: (path, read_picture(path)) for path in files}
 
 
@@ -105,8 +107,9 @@ def test_madison_has_vehicles_our_marks_of_people_and_a_border_that_says_nothing
     assert (border == wanted).all()
 
 
-def test_of_a_field_all_but_the_marked_cars_is_ground(tmp_path):
+def test_of_a_field_all_but_the_marked_cars_is_ground(tmp_path, monkeypatch):
     """Stones were people and shadows of trees cars: only marks say what stands there, whatever size is kept."""
+    monkeypatch.setattr("hvt_train.pictures.real._CODED_SHARE", 0)
     write_hit(tmp_path / "hit_uav", [])
     folder = tmp_path / "field"
     folder.mkdir()
