@@ -65,7 +65,7 @@ def test_the_forecast_has_perception_within_what_video_leaves(capsys, monkeypatc
     monkeypatch.setattr("hvt_fleet.edge_doctor.processors", lambda: 2.0)
     monkeypatch.setattr("hvt_fleet.edge_doctor.CpuMeter.measure", lambda *_, **__: None)
     monkeypatch.setattr("hvt_fleet.edge_doctor.detect_every", lambda *_, **__: 1e-6)
-    now = SimpleNamespace(monotonic=count(0, 0.001).__next__, process_time=count(0, 0.001).__next__)
+    now = SimpleNamespace(monotonic=count(0, 0.01).__next__, process_time=count(0, 0.01).__next__)
     monkeypatch.setattr("hvt_fleet.edge_doctor.time", now)
     _, findings = examined(capsys, EDGE, "--source", str(scene), *CHEAP, "--connect", "tcp/127.0.0.1:9")
     found = findings["processor"]

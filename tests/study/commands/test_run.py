@@ -28,19 +28,11 @@ macro_f1 recall f1 delay_p95_ms id_switches"""
 METHODS = ("--methods", "M0,M5,DDS", "--regimes", REGIME)
 
 
-class _Here(ThreadPoolExecutor):
-    """This process: one of the study loads all packages anew, and test_compare.py and test_stop.py fly in such."""
-
-    _processes = None
-
-    def __init__(self, *_, **__):
-        super().__init__(1)
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _in_this_process():
+    """One of the study loads all packages anew; test_compare.py and, at night, test_stop.py fly in such."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hvt_study.matrix.pools._Processes", _Here)
+        patch.setattr("hvt_study.commands.arguments.local_pool", ThreadPoolExecutor)
         yield
 
 

@@ -7,6 +7,7 @@ import pytest
 from hvt_common.values import Detections
 from hvt_train.learning.calibration import fit_calibration
 from hvt_train.pictures.kinds import ID, LARGE_VEHICLE
+from hvt_train.pictures.pool import through_x265
 from hvt_train.pictures.real import HeldOut, fill_real, held_out_pictures
 from hvt_train.pictures.views import ViewSettings, ViewSource, read_picture
 from studies.real_sets import write_hit, write_yolo
@@ -32,9 +33,9 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pool(data, tmp_path_factory):
-    """What `fill_real` makes of them, by name; x265 codes one picture of each view in place of six."""
+    """What `fill_real` makes of them, by name; x265 codes the last of six pictures alone."""
     with pytest.MonkeyPatch.context() as short:
-        short.setattr("hvt_train.pictures.pool._CODED_FRAMES", 1)
+        short.setattr("hvt_train.pictures.pool.through_x265", lambda six, bps: through_x265(six[-1:], bps))
         files = fill_real(tmp_path_factory.mktemp("pool"), data)
     return {path.stem: (path, read_picture(path)) for path in files}
 
@@ -109,7 +110,7 @@ def test_madison_has_vehicles_our_marks_of_people_and_a_border_that_says_nothing
 
 def test_of_a_field_all_but_the_marked_cars_is_ground(tmp_path, monkeypatch):
     """Stones were people and shadows of trees cars: only marks say what stands there, whatever size is kept."""
-    monkeypatch.setattr("hvt_train.pictures.real._CODED_SHARE", 0)
+    monkeypatch.setattr("hvt_train.pictures.real.in_flight", lambda image, *_, **__: image)
     write_hit(tmp_path / "hit_uav", [])
     folder = tmp_path / "field"
     folder.mkdir()
