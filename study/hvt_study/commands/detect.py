@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ from hvt_study.metrics.picture_score import (
 )
 
 _CELL_PX, _TEXT_PX = 150, 18
+_CELL_SHAPE = (_CELL_PX + _TEXT_PX, _CELL_PX, 3)
 _CELLS_ACROSS, _CELLS_DOWN = 8, 5
 _CONTEXT = 2.5
 """Sides of the crop, in longer sides of the box."""
@@ -70,16 +72,20 @@ def write_sheet(path: Path, findings: Sequence[Finding]) -> None:
     if not worst:
         path.unlink(missing_ok=True)
         return
-    cells = [_cell(one) for one in worst]
-    blank = np.zeros_like(cells[0])
-    cells += [blank] * (-len(cells) % _CELLS_ACROSS)
+    read = lru_cache(maxsize=1)(read_image)
+    cells = np.zeros((-(-len(worst) // _CELLS_ACROSS) * _CELLS_ACROSS, *_CELL_SHAPE), np.uint8)
+    for place in sorted(
+        range(len(worst)), key=lambda place: worst[place].picture.path
+    ):  # each is opened once
+        picture = worst[place].picture
+        image = read(picture.path, picture.labelled_size)
+        assert image is not None, "it was detected on"
+        cells[place] = _cell(worst[place], image)
     rows = [np.hstack(cells[start : start + _CELLS_ACROSS]) for start in range(0, len(cells), _CELLS_ACROSS)]
     path.write_bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())
 
 
-def _cell(finding: Finding) -> Image:
-    image = read_image(finding.picture.path, finding.picture.labelled_size)
-    assert image is not None, "it was detected on"
+def _cell(finding: Finding, image: Image) -> Image:
     x1, y1, x2, y2 = finding.box_px
     reach = max(_LEAST_CROP_PX, _CONTEXT * max(x2 - x1, y2 - y1))
     scale = _CELL_PX / reach

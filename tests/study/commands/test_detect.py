@@ -2,8 +2,10 @@
 
 import csv
 import json
+from collections import Counter
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from hvt_scene import Scene
 from hvt_scene.truth import Truth
 from hvt_study.cli import main
 from hvt_study.commands.detect import print_score
+from hvt_study.datasets.label_files import read_image
 from hvt_study.metrics.picture_score import along_line, calibration_error, chance_error, fitted_line
 from programs.small_disk import files_at_most
 
@@ -57,9 +60,11 @@ def sentence(capsys, *arguments):
     return captured.err.splitlines()[-1]
 
 
-def test_figures_files_and_sheets(tmp_path, capsys):
+def test_figures_files_and_sheets(tmp_path, capsys, monkeypatch):
     """The embedded detector on the scene it knows: found, scored, shown; an unreadable picture costs only itself."""
     folder, out = draw(tmp_path / "set"), tmp_path / "out"
+    read = Mock(wraps=read_image)
+    monkeypatch.setattr("hvt_study.commands.detect.read_image", read)
     (folder / "images" / "broken.png").write_bytes(b"no picture")
     assert main(["detect", str(folder), "--provider", "cpu", "--vehicles-as-one", "--out", str(out)]) == 0
     said = capsys.readouterr().err
@@ -82,6 +87,9 @@ def test_figures_files_and_sheets(tmp_path, capsys):
     ]
     assert sheets
     assert all(sheet is not None and sheet.shape[1] == 8 * 150 for sheet in sheets)
+    assert max(Counter(call.args[0] for call in read.call_args_list).values()) <= 3, (
+        "to detect, and for each sheet"
+    )
 
 
 def test_classes_that_a_set_does_not_label_count_neither_way(tmp_path):
