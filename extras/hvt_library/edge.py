@@ -13,7 +13,7 @@ from typing import Any, Self, cast
 import numpy as np
 
 from hvt_common.config import load, settings_words
-from hvt_common.errors import UserError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.failures import RetryPause
 from hvt_common.values import Fit, Image
 from hvt_edge.app import Edge
@@ -66,7 +66,8 @@ class PushedEdge:
         """Hand over a frame: (height, width, 3) uint8 BGR, copied. The first one sets the source's size.
 
         ``capture_ns`` is its capture time, Unix nanoseconds, a whole number; None is now. Raises `ValueError` for
-        another array or time, and `UserError` or `FlightError` if that has ended the edge.
+        another array or time, `UserError` or `FlightError` if that has ended the edge, and `FlightError` after
+        its end.
         """
         taken_ns = self._clock() if capture_ns is None else _nanoseconds(capture_ns)
         if not isinstance(frame_bgr, np.ndarray):
@@ -81,6 +82,8 @@ class PushedEdge:
                 f"a frame of {frame_bgr.dtype} {frame_bgr.shape} is not accepted: (height, width, 3) uint8 is"
             )
         self._flight.raise_error()
+        if self._stop.is_set() or not self._flight.thread.is_alive():
+            raise FlightError("the edge has ended: it sends no more frames")
         self._grabber.put(frame_bgr.copy(), taken_ns)
 
     def close(self) -> None:
@@ -100,7 +103,7 @@ class PushedEdge:
 
     def _cancel(self) -> None:
         self._stop.set()
-        self._grabber.cancel_opening()
+        self._grabber.begin_closing()
 
     def _run(self) -> dict[str, Any]:
         try:
@@ -131,7 +134,7 @@ class _PushGrabber:
         self._news = threading.Condition()
         self._newest: tuple[Image, int] | None = None
         self._replaced = 0
-        self._opened = self._ended = False
+        self._opened = self._closing = self._ended = False
 
     def put(self, frame_bgr: Image, capture_ns: int) -> None:
         with self._news:
@@ -144,8 +147,10 @@ class _PushGrabber:
             self._ended = True
             self._news.notify_all()
 
-    def cancel_opening(self) -> None:
+    def begin_closing(self) -> None:
+        """From now on no frame is missed; who waits for the first one is told."""
         with self._news:
+            self._closing = True
             self._ended |= not self._opened
             self._news.notify_all()
 
@@ -166,9 +171,11 @@ class _PushGrabber:
 
     def grab(self) -> Shot:
         with self._news:
-            self._news.wait_for(lambda: self._newest or self._ended, PATIENCE_S)
+            if not self._news.wait_for(lambda: self._newest or self._ended, PATIENCE_S) and self._closing:
+                self._news.wait_for(lambda: self._newest or self._ended)
             if self._newest is None:
-                raise SignalLost(f"no frame was pushed for {PATIENCE_S:g} s")
+                away = f"no frame was pushed for {PATIENCE_S:g} s"
+                raise SignalLost("it is closed" if self._ended else away)
             (frame_bgr, capture_ns), self._newest = self._newest, None
             replaced, self._replaced = self._replaced, 0
         return Shot(lambda: frame_bgr, camera_ns=capture_ns, missed=replaced)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 import cv2
@@ -17,7 +18,7 @@ from hvt_common.errors import FlightError, UserError
 from hvt_edge.source import live
 from hvt_ground.events import Overlay
 from hvt_library import edge as library
-from hvt_library.edge import PushedEdge
+from hvt_library.edge import PushedEdge, _PushGrabber
 from hvt_library.ground import Picture, Received, _Events
 from media.recorded_feed import drawn_frames
 from programs.processes import eventually, free_ports
@@ -153,11 +154,28 @@ def test_a_program_that_pushes_again_after_a_pause_is_sent_at_once(monkeypatch, 
         eventually(lambda: edge.push(frame) or "works again" in caplog.text, what="it is there again")
 
 
+def test_a_program_that_closes_while_the_edge_begins_is_not_away(monkeypatch):
+    """On a busy machine its summary said that the source had failed, and the log that it is tried again."""
+    monkeypatch.setattr(library, "PATIENCE_S", 0)
+    grabber = _PushGrabber()
+    grabber.put(np.zeros((96, 128, 3), np.uint8), 0)
+    grabber.open()
+    grabber.grab()
+    grabber.begin_closing()
+    with ThreadPoolExecutor(1) as pool:
+        grabbing = pool.submit(grabber.grab)
+        grabber.end()
+        with pytest.raises(live.SignalLost, match="it is closed"):
+            grabbing.result()
+
+
 def test_an_edge_that_never_got_a_frame_ends_quietly():
-    """A program that could not open its camera would hang at its end."""
+    """A program that could not open its camera would hang at its end; one that pushes later would think it sends."""
     with hvt_edge.open(connect="tcp/127.0.0.1:9", detector="motion") as edge:
         pass
     assert edge.summary == {}
+    with pytest.raises(FlightError, match="the edge has ended: it sends no more frames"):
+        edge.push(np.zeros((96, 128, 3), np.uint8))
 
 
 ENDING = """
