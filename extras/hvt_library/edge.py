@@ -174,8 +174,8 @@ class _PushGrabber:
             if not self._news.wait_for(lambda: self._newest or self._ended, PATIENCE_S) and self._closing:
                 self._news.wait_for(lambda: self._newest or self._ended)
             if self._newest is None:
-                away = f"no frame was pushed for {PATIENCE_S:g} s"
-                raise SignalLost("it is closed" if self._ended else away)
+                reason = f"no frame was pushed for {PATIENCE_S:g} s"
+                raise SignalLost("it is closed" if self._ended else reason)
             (frame_bgr, capture_ns), self._newest = self._newest, None
             replaced, self._replaced = self._replaced, 0
         return Shot(lambda: frame_bgr, camera_ns=capture_ns, missed=replaced)

@@ -184,8 +184,9 @@ class LiveSource(Source):
     def _take(self, shot: Shot, capture_ns: int, *, jitter_ns: int) -> None:
         # A frame has come (the reader's thread); those of the last ``jitter_ns`` may have come with it.
         self.unreadable += shot.damaged
+        shot_missed = self._gate.wanted(shot.missed, before_ns=capture_ns)
         if not self._gate.accept(capture_ns):
-            self.missed += shot.missed
+            self.missed += shot_missed
             self.passed_over += 1
             return
         image = shot.image()
@@ -194,7 +195,7 @@ class LiveSource(Source):
             if not together and (self._missed_ns is None or capture_ns - self._missed_ns >= _STEADY_NS):
                 together = list(self._pending)[-1:]
             together = together[1 - _MOST_PENDING :]
-            missed = len(self._pending) - len(together) + shot.missed
+            missed = len(self._pending) - len(together) + shot_missed
             if missed:
                 self.missed, self._missed_ns = self.missed + missed, capture_ns
             self._pending = deque([*together, (capture_ns, image)])

@@ -89,6 +89,11 @@ class Gate:
         self._due_ns = (capture_ns if late or self._due_ns is None else self._due_ns) + self._period_ns
         return True
 
+    def wanted(self, count: int, *, before_ns: int) -> int:
+        """How many of ``count`` frames were due that did not come before the one of that time."""
+        due_ns = before_ns if self._due_ns is None else self._due_ns
+        return min(count, max(0, (before_ns - due_ns) // self._period_ns))
+
 
 class Resizer:
     """Makes base frames out of source pictures of one size.

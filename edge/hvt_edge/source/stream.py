@@ -6,7 +6,7 @@ import itertools
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from fractions import Fraction
 from functools import partial
@@ -53,6 +53,9 @@ _OF_NO_SIZE = ("_pipe", "jpeg", "hls", "sdp")
 _LEAST_INVENTED = 2**31 - 1
 """Cameras that send for ever give such lengths, for HTTP wants one."""
 _PLAYLIST = ".m3u8"
+_BEHIND_S, _MOST_STEP_S = 1.0, 1
+_WINDOW_S, _WAITS_SHARE = 1.0, 0.1
+"""Who has waited for packets for a tenth of the last second has none that wait for him."""
 _MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
 """A packet later or earlier than this sets the time for the next ones: after a stall, or a jump of the stamps."""
 _OPTIONS = {
@@ -152,7 +155,11 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     times: dict[Fraction, int] = {}
     damaged: int | None = None
     until_s, stamped, decoder = time.monotonic() + FIRST_S, is_stamped(container), Decoder(stream)
-    for packet in live_packets_of(container, stream):
+    missed = 0
+    for packet, left_out in _in_time(
+        live_packets_of(container, stream), partial(_note_gap, stream, pictures)
+    ):
+        missed += left_out
         camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
@@ -172,10 +179,49 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
                 base = frame.time_base
                 at_s = None if frame.pts is None or base is None else frame.pts * base
                 camera_ns = None if at_s is None else times.pop(at_s, None)
-                yield Shot(partial(pictures.bgr, frame), camera_ns, damaged=damaged or 0)
-                damaged = 0
+                yield Shot(partial(pictures.bgr, frame), camera_ns, missed=missed, damaged=damaged or 0)
+                damaged = missed = 0
         if len(times) > _MOST_TIMES:
             times.clear()
+
+
+def _note_gap(stream: Any, pictures: Pictures) -> None:
+    stream.codec_context.flush_buffers()
+    pictures.say(
+        "it comes faster than this machine decodes it: its pictures stop up to a keyframe at times; let the camera "
+        "send fewer or smaller ones"
+    )
+
+
+def _in_time(packets: Iterator[Any], note_gap: Callable[[], None]) -> Iterator[tuple[Any, int]]:
+    # Each packet, and how many were left out before it: those up to a keyframe, once decoding is a second behind
+    # them. They would wait longer and longer, and be called live: to `CameraClock` a queue that grows looks like
+    # stamps that count another second.
+    late_s = waited_s = 0.0
+    left_out = count = between = 0
+    requested_s = since_s = before_s = time.monotonic()
+    before_at: Fraction | None = None
+    for packet in packets:
+        now_s, at = time.monotonic(), None if packet.dts is None else packet.dts * packet.time_base
+        waited_s += now_s - requested_s
+        if at is not None and before_at is not None and 0 <= at - before_at < _MOST_STEP_S:
+            late_s = max(0.0, late_s + now_s - before_s - float(at - before_at))
+        before_s, before_at = now_s, at
+        if now_s - since_s > _WINDOW_S:
+            late_s *= waited_s < _WAITS_SHARE * (now_s - since_s)
+            waited_s, since_s = 0.0, now_s
+        count += 1
+        if packet.is_keyframe:
+            between, count = count, 0
+        behind = late_s > (_BEHIND_S / 2 if left_out else _BEHIND_S)
+        # A film that is refreshed without keyframes is decoded whole.
+        if (behind or (left_out and not packet.is_keyframe)) and count < 2 * between:
+            note_gap()
+            left_out += 1
+        else:
+            yield packet, left_out
+            left_out = 0
+        requested_s = time.monotonic()
 
 
 class _PyAvClock:

@@ -102,6 +102,15 @@ def test_a_camera_that_pauses_does_not_burst_afterwards():
     assert len([t for t in taken if 60 <= t < 60.9]) == 10
 
 
+def test_of_frames_that_were_left_out_those_count_that_were_due():
+    """Of a camera of 60 frames a second four times as many would be called lost as could be seen."""
+    gate = Gate(10)
+    assert gate.wanted(5, before_ns=10**9) == 0, "before the first none was due"
+    gate.accept(0)
+    assert [gate.wanted(count, before_ns=10**9) for count in (60, 5, 0)] == [9, 5, 0]
+    assert gate.wanted(60, before_ns=10**8) == 0
+
+
 @given(
     source=st.tuples(st.integers(16, 4000), st.integers(16, 4000)),
     base=st.tuples(st.integers(32, 2000), st.integers(32, 2000)),

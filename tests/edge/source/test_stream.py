@@ -20,7 +20,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_edge.source import stream
 from hvt_edge.source.live import SignalLost
 from hvt_edge.source.opening import open_source
-from hvt_edge.source.stream import StreamGrabber
+from hvt_edge.source.stream import StreamGrabber, _in_time
 
 
 def film_that_stops(*, pictures: int = 10, tones: int = 200, **options: str) -> io.BytesIO:
@@ -82,6 +82,36 @@ def test_a_stream_that_comes_in_segments_is_played_by_its_own_time(tmp_path, mon
     with av.open(str(tmp_path / "a.m3u8")) as live:
         came_s = [now_s[0] for packet in stream.live_packets_of(live, live.streams.video[0]) if packet.size]
     assert came_s == pytest.approx([number / 25 for number in range(30)])
+
+
+@pytest.mark.parametrize(
+    ("decoding_s", "rate", "keyframes", "kept"),
+    [
+        (0.03, 25, 50, (1.0, 1.0)),
+        (0.045, 25, 50, (0.7, 0.9)),
+        (0.1, 25, 50, (0.2, 0.4)),
+        (0.1, 25, 1, (0.4, 0.4)),
+        (0.1, 25, 10**6, (1.0, 1.0)),
+        (0.1, 8, 50, (1.0, 1.0)),
+    ],
+    ids=["quick", "a little slow", "slow", "slow, JPEGs", "slow, never a keyframe", "quick, wrong stamps"],
+)
+def test_a_camera_that_is_decoded_too_slowly_stays_live(monkeypatch, decoding_s, rate, keyframes, kept):
+    """Its pictures came later and later, 14 s after half a minute, and were called live."""
+    now_s, late_s, count = [0.0], [], 0
+    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+
+    def packets():
+        for number in range(120 * rate):
+            now_s[0] = max(now_s[0], number / rate)  # one that has come already is there at once
+            yield SimpleNamespace(dts=number, time_base=Fraction(1, 25), is_keyframe=number % keyframes == 0)
+
+    for packet, left_out in _in_time(packets(), lambda: None):
+        assert not left_out or packet.is_keyframe
+        count, late_s = count + 1, [*late_s, now_s[0] - packet.dts / rate]
+        now_s[0] += decoding_s
+    assert kept[0] <= count / (120 * rate) <= kept[1] + 0.02
+    assert max(late_s[100:]) < 1.6 or keyframes > 50, "once the camera's second keyframe has come"
 
 
 def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(quarters):
