@@ -68,7 +68,10 @@ class World:
                     f"--pose demo is of the drawn scene, and --source is {shown(str(config.source))}"
                 )
             return PoseTable(source.poses())
-        return open_pose(config.pose, hfov_deg=config.fov, clock=self.clock)
+        opened = open_pose(config.pose, hfov_deg=config.fov, clock=self.clock)
+        if isinstance(opened, PoseTable) and source.frame_count and config.max_frames is None:
+            opened.compare(clip_s=source.frame_count / source.fps)
+        return opened
 
     def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
         """Open the link until ``stack`` closes. Raises `UserError` for a bad port, endpoint or edge id."""

@@ -23,6 +23,7 @@ _FILE: Final = "file"
 """The entry point for every ``--pose`` whose word names no other."""
 _WHAT: Final = "pose source"
 MOST_GAP_S: Final = 10.0
+_MUCH_LONGER: Final = 1.1
 _BEYOND_NS: Final = SECOND_NS
 """How long before the first pose and after the last one they still count."""
 _MOST_BPS: Final = 300
@@ -85,6 +86,13 @@ class PoseTable:
         self._times = [one.capture_ns for one in poses]
         self._most_gap_ns = round(most_gap_s * SECOND_NS)
         self.trouble = ""
+
+    def compare(self, *, clip_s: float) -> None:
+        """Note that the poses go on long after a clip's end: they are another flight's, or begin before it."""
+        end_s = self._times[-1] / SECOND_NS
+        if end_s > max(clip_s + MOST_GAP_S, _MUCH_LONGER * clip_s):
+            ends = f"they end at {end_s:.0f} s, the clip at {clip_s:.0f} s"
+            self.notes += (f"{ends}: are they this clip's, and is their time 0 its first frame?",)
 
     def at(self, media_ns: int, *, capture_ns: int) -> Pose | None:
         """The pose at this moment of the clip, between the two around it; None in a gap or beyond the ends."""

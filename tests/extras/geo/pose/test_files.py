@@ -1,13 +1,17 @@
 """Poses from files as people have them, and what is said of those that cannot be read."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
+from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.pose import open_pose
+from hvt_edge.world import World
 from hvt_geo.pose.angles import compass_deg, euler_deg
 from hvt_geo.pose.files import read_poses
 
@@ -158,6 +162,19 @@ def test_beyond_its_ends_and_in_a_gap_a_file_says_nothing(tmp_path):
     assert "20 s" in table.trouble
     assert table.at(42 * SECOND_NS, capture_ns=0) is None
     assert table.at(40 * SECOND_NS, capture_ns=0) is not None
+
+
+@pytest.mark.parametrize(("frames", "says"), [(300, "they end at 300 s, the clip at 30 s"), (2900, "")])
+def test_poses_that_go_on_after_the_clip_are_told_of(tmp_path, frames, says):
+    """A whole flight's, or another's, put each object of a clip from its midst at a wrong place without a word."""
+    path = tmp_path / "a.csv"
+    path.write_text(f"{PLACE}\n" + "".join(f"{second},47,8\n" for second in range(0, 301, 5)))
+    config = EdgeConfig(source="a.mp4", pose=str(path))
+    source: Any = SimpleNamespace(frame_count=frames, fps=10.0)
+    poses = World().open_pose(config, source)
+    assert poses is not None
+    assert says in " ".join(poses.notes)
+    assert bool(poses.notes) == bool(says)
 
 
 FIRST = MINI.split("2\n00:", maxsplit=1)[0]
