@@ -144,7 +144,9 @@ class Pictures:
             bits = components[0].bits
             own = np.asarray(levels, np.uint16) >> (16 - bits)
             return self._stretch.bgr(own, at_s=frame.time or 0.0, bits=bits)
-        if frame.format.is_rgb and components[0].bits == _MOST_BITS and frame.color_trc not in _HDR:
+        deep_bayer = frame.format.is_bayer and frame.format.bits_per_pixel == _MOST_BITS
+        is_deep = deep_bayer or components[0].bits == _MOST_BITS
+        if frame.format.is_rgb and is_deep and frame.color_trc not in _HDR:
             deep = self._reformatter.reformat(frame, width=wide, height=high, format="bgr48le", threads=1)
             return self._stretch.colours(np.asarray(deep.to_ndarray(), np.uint16))
         more: dict[str, Any] = {}

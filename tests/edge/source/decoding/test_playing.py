@@ -348,6 +348,17 @@ def test_dark_colours_of_sixteen_bits_stay_dark_and_are_said(tmp_path, most):
         assert (f"go up to {most[0]} of 65535" in " ".join(source.notes)) == (most[0] == 1000)
 
 
+def test_dark_levels_of_a_bayer_sensor_are_said(tmp_path):
+    """An industrial camera's twelve bits were nearly black without a word."""
+    with av.open(str(tmp_path / "a.nut"), "w") as container:
+        stream = container.add_stream("rawvideo", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "bayer_rggb16le"
+        packet = av.Packet(np.full((64, 64), 2000, "<u2").tobytes())
+        packet.stream, packet.pts, packet.dts, packet.time_base = stream, 0, 0, Fraction(1, 30)
+        container.mux(packet)
+    assert "16-bit colours go up to 2000 of 65535" in " ".join(play(tmp_path / "a.nut")[0].notes)
+
+
 @pytest.mark.parametrize(
     ("names", "says"),
     [
