@@ -13,6 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import av
+import av.error
 import cv2
 import numpy as np
 
@@ -31,6 +33,8 @@ _USUAL = (".jpg", ".jpeg", ".webp", ".bmp", ".png", ".tif", ".tiff")
 _ENDINGS = (*_USUAL, ".jpe", ".jfif", ".jp2", ".pgm", ".ppm", ".pnm")
 """Beside usual ones the others are masks or depths of the same pictures; so is 1.png beside 1.jpg, or 1.tif."""
 _MOST_SERIES = 9
+_GREY_AND_ALPHA = (b"\2\1\3\0\2\0\0\0\x10\0\x10\0", b"\1\2\0\3\0\0\0\2\0\x10\0\x10")
+"""TIFF's BitsPerSample (258) of 16 and 16, in both orders of bytes: OpenCV keeps eight."""
 _PNG, _PNG_KIND, _PNG_COLOUR = b"\x89PNG", 25, 2
 """How the file begins, the place of its colour type, and that type's bit for colour."""
 
@@ -227,6 +231,9 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
         if not data.size:
             return None
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        if is_tiff(str(file)) and any(said in data.tobytes() for said in _GREY_AND_ALPHA):
+            (frame,) = av.CodecContext.create("tiff", "r").decode(av.Packet(data.tobytes()))
+            image = frame.reformat(format="gray16le").to_ndarray()
         deep = stretch or Stretch(lambda _: None)
         if image is not None and image.itemsize > 1:
             if data[:4].tobytes() == _PNG and not data[_PNG_KIND] & _PNG_COLOUR:
@@ -238,6 +245,11 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
             return deep.colours(np.asarray(image, np.uint16)[..., :3])
         # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):  # it has just gone, or its header claims too large a size
+    except (
+        OSError,
+        ValueError,
+        av.error.FFmpegError,
+        cv2.error,
+    ):  # it has just gone, or its header claims too large a size
         return None
     return None if image is None else np.asarray(image, np.uint8)

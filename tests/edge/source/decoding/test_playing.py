@@ -321,15 +321,18 @@ def test_pictures_of_heat_in_a_folder_are_stretched_too(tmp_path, unseen):
         assert "stretched" in " ".join(source.notes)
 
 
-def test_grey_with_transparency_is_stretched_in_a_folder_too(tmp_path):
-    """The file alone was stretched, and in a folder nearly the same grey all over."""
-    frame = av.VideoFrame(64, 48, "ya16be")
+@pytest.mark.parametrize(("kind", "pixels"), [("png", "ya16be"), ("tiff", "ya16le")])
+def test_grey_with_transparency_is_stretched_in_a_folder_too(tmp_path, kind, pixels):
+    """The file alone was stretched, and in a folder, or of a TIFF, it was nearly the same grey all over."""
+    frame = av.VideoFrame(64, 48, pixels)
     grey = np.where(np.arange(48)[:, None] < 24, 7000, 7200).repeat(64, axis=1)
-    frame.planes[0].update(np.dstack([grey, np.full_like(grey, 65_535)]).astype(">u2").tobytes())
-    coder = av.CodecContext.create("png", "w")
-    coder.width, coder.height, coder.pix_fmt, coder.time_base = 64, 48, "ya16be", Fraction(1, 25)
-    (tmp_path / "0.png").write_bytes(b"".join(map(bytes, [*coder.encode(frame), *coder.encode(None)])))
-    for place in (tmp_path / "0.png", tmp_path):
+    frame.planes[0].update(
+        np.dstack([grey, np.full_like(grey, 65_535)]).astype(">u2" if "be" in pixels else "<u2").tobytes()
+    )
+    coder = av.CodecContext.create(kind, "w")
+    coder.width, coder.height, coder.pix_fmt, coder.time_base = 64, 48, pixels, Fraction(1, 25)
+    (tmp_path / f"0.{kind}").write_bytes(b"".join(map(bytes, [*coder.encode(frame), *coder.encode(None)])))
+    for place in (tmp_path / f"0.{kind}", tmp_path):
         source, pictures = play(place)
         assert pictures[0][(10, 40), 30, 0].tolist() == [0, 255]
         assert "stretched" in " ".join(source.notes)
