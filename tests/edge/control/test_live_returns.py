@@ -194,8 +194,8 @@ def any_flight(seed: int) -> tuple[dict, dict, list[tuple[float, float]], list[f
 @pytest.mark.parametrize(
     "seeds",
     [
-        range(0, 60, 6),
-        *(pytest.param(range(first, 60, 6), marks=pytest.mark.nightly) for first in range(1, 6)),
+        range(0, 60, 12),
+        *(pytest.param(range(first, 60, 12), marks=pytest.mark.nightly) for first in range(1, 12)),
     ],
 )
 def test_from_every_state_live_video_is_back_within_three_seconds(seeds, loses):
