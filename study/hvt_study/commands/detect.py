@@ -81,7 +81,9 @@ def write_sheet(path: Path, findings: Sequence[Finding]) -> None:
         image = read(picture.path, picture.labelled_size)
         assert image is not None, "it was detected on"
         cells[place] = _cell(worst[place], image)
-    rows = [np.hstack(cells[start : start + _CELLS_ACROSS]) for start in range(0, len(cells), _CELLS_ACROSS)]
+    rows = [
+        np.hstack([*cells[start : start + _CELLS_ACROSS]]) for start in range(0, len(cells), _CELLS_ACROSS)
+    ]
     path.write_bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())
 
 
