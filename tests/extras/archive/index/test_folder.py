@@ -235,28 +235,30 @@ def test_a_disk_that_is_unmounted_and_comes_back_has_its_index(copied):
     assert [one.file for one in read_index(away)] == NAMES
 
 
-def test_a_ground_that_ends_while_it_reads_many_files_leaves_them_to_the_next(copied, monkeypatch):
+@pytest.mark.parametrize("job", ["described", "remove_video"])
+def test_a_ground_that_ends_while_it_is_at_old_files_leaves_them_to_the_next(copied, monkeypatch, job):
     """It said that what it had yet to write was lost; and live video waited for the reading of old files.
 
     One large file, or one on a busy machine, took the rows of the flight that had come meanwhile with it.
     """
     (row, _), ended = read_index(copied), threading.Event()
-    (copied / INDEX).unlink()
-    read, failures = [], Failures(time.time_ns)
+    begun, failures = [], Failures(time.time_ns)
 
-    def described(path: Path) -> RecordingRow | None:
-        read.append((path.name, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
+    def long(path: Path) -> None:
+        begun.append((path.name, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
         ended.wait()
-        return files.described(path)
 
-    monkeypatch.setattr(folder, "described", described)
-    with RecordingsFolder(copied, ALL, failures=failures) as index:
+    if job == "described":
+        (copied / INDEX).unlink()
+    monkeypatch.setattr(folder, job, long)
+    rules = ALL if job == "described" else Retention(video_age=Limit(seconds=1e-6))
+    with RecordingsFolder(copied, rules, failures=failures) as index:
         index.begin()
-        eventually(lambda: read, what="it reads")
-        index.recorded(replace(row, file="flown.rrd"))
+        eventually(lambda: begun, what="it is at one")
+        index.recorded(replace(row, file="flown.rrd", whole=False))
     ended.set()
-    assert ([name for name, _ in read], failures.parts) == (NAMES[1:], ())
-    assert read[0][1] >= 10
+    assert ([name for name, _ in begun], failures.parts) == (NAMES[job == "described" :][:1], ())
+    assert begun[0][1] >= 10
     assert "flown.rrd" in [one.file for one in read_index(copied)]
     monkeypatch.undo()
     assert [(one.file, one.frames) for one in look(copied)] == [(name, 30) for name in NAMES]
