@@ -115,7 +115,7 @@ class EdgeSessions:
         self.error: BaseException | None = None
         self._stopped_ns: int | None = None
 
-    def start(self, *, drain_s: float = 1.0) -> Self:
+    def start(self, *, drain_s: float = 6.0) -> Self:
         """Begin the thread. When it stops, arrived messages are still taken in, for at most ``drain_s``."""
         self._drain_ns = round(drain_s * SECOND_NS)
         name = f"hvt-receive-{self.port.edge}"
@@ -143,10 +143,16 @@ class EdgeSessions:
         log_fields(edge=self.port.edge)
         try:
             while self._stopped_ns is None or (
-                len(inbox) and time.monotonic_ns() - self._stopped_ns <= self._drain_ns
+                (left := len(inbox)) and time.monotonic_ns() - self._stopped_ns <= self._drain_ns
             ):
                 item = inbox.get(timeout_s=0.05)
                 self.work(item, pending=len(inbox) > 0)
+            if left:
+                self.failures.failed(
+                    self._part,
+                    f"{left} of the messages that had come are not in it: it ended before",
+                    last=True,
+                )
             self.close()
         except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
             self.error = error

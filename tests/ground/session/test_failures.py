@@ -1,21 +1,26 @@
 """What goes wrong in one session ends that session, with its recording whole; another begins, others go on."""
 
 import logging
+import re
 import sys
+import threading
 import time
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
+from hvt_ground.session import edge_sessions
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
@@ -273,6 +278,32 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert rig.sessions.failures.parts[0].working
     assert rig.sessions.join(timeout_s=60)
     assert sum("all else goes on" in one.getMessage() for one in caplog.records) == 1
+
+
+@pytest.mark.parametrize("waiting", [3, 20])
+def test_on_a_busy_machine_messages_that_had_come_are_taken_in_or_their_loss_said(
+    flight, tmp_path, monkeypatch, waiting
+):
+    """A second after Ctrl-C the rest of a flight was thrown away without a word."""
+    rig, now_ns, goes_on = Rig(flight, Consumer(tmp_path)), [time.monotonic_ns()], threading.Event()
+    rig.put(*range(10))
+    get = rig.inbox.get
+
+    def slow(*, timeout_s: float) -> Received | None:
+        goes_on.wait()
+        now_ns[0] += 3 * SECOND_NS // 2
+        return get(timeout_s=timeout_s)
+
+    monkeypatch.setattr(edge_sessions, "time", SimpleNamespace(monotonic_ns=lambda: now_ns[0]))
+    monkeypatch.setattr(rig.inbox, "get", slow)
+    for index in range(10, 10 + waiting):
+        rig.inbox.put(flight.base(index))
+    rig.sessions.stop()
+    goes_on.set()
+    assert rig.sessions.join(timeout_s=60)
+    said = [one.reason for one in rig.sessions.failures.parts]
+    assert rig.decoded == [13] if waiting == 3 else re.fullmatch(r"1[3-5] of the messages .*", *said)
+    assert bool(said) == (waiting == 20)
 
 
 def test_what_waits_behind_a_hole_is_received_though_nothing_more_comes(flight, tmp_path):

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 
-from hvt_archive.index import files, folder
+from hvt_archive.index import folder
 from hvt_archive.index.database import INDEX, read_index
 from hvt_archive.index.files import claimed, is_claimed, remove_video
 from hvt_archive.index.folder import IndexWriter, RecordingsFolder
