@@ -26,7 +26,7 @@ from hvt_library.program import InThread
 
 _NAME = "pushed frames"
 PATIENCE_S = 5.0
-"""A program that pushes nothing for this long is reported as away, as a camera is."""
+"""A program that pushes nothing for this long, and for two frames, is reported as away, as a camera is."""
 
 
 def open_edge(**settings: object) -> PushedEdge:
@@ -51,7 +51,7 @@ class PushedEdge:
     """
 
     def __init__(self, config: EdgeConfig) -> None:
-        self._grabber = _PushGrabber()
+        self._grabber = _PushGrabber(fps=config.nominal_fps)
         self._stop = threading.Event()
         world = _PushedWorld(self._grabber)
         self._clock = world.clock
@@ -130,7 +130,8 @@ class _PushGrabber:
     name = _NAME
     notes = None
 
-    def __init__(self) -> None:
+    def __init__(self, *, fps: float) -> None:
+        self._patience_s = max(PATIENCE_S, 2 / fps)
         self._news = threading.Condition()
         self._newest: tuple[Image, int] | None = None
         self._replaced = 0
@@ -171,10 +172,13 @@ class _PushGrabber:
 
     def grab(self) -> Shot:
         with self._news:
-            if not self._news.wait_for(lambda: self._newest or self._ended, PATIENCE_S) and self._closing:
+            if (
+                not self._news.wait_for(lambda: self._newest or self._ended, self._patience_s)
+                and self._closing
+            ):
                 self._news.wait_for(lambda: self._newest or self._ended)
             if self._newest is None:
-                reason = f"no frame was pushed for {PATIENCE_S:g} s"
+                reason = f"no frame was pushed for {self._patience_s:.3g} s"
                 raise SignalLost("it is closed" if self._ended else reason)
             (frame_bgr, capture_ns), self._newest = self._newest, None
             replaced, self._replaced = self._replaced, 0

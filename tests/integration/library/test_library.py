@@ -157,10 +157,14 @@ def test_a_program_that_pushes_again_after_a_pause_is_sent_at_once(monkeypatch, 
 def test_a_program_that_closes_while_the_edge_begins_is_not_away(monkeypatch):
     """On a busy machine its summary said that the source had failed, and the log that it is tried again."""
     monkeypatch.setattr(library, "PATIENCE_S", 0)
-    grabber = _PushGrabber()
+    grabber = _PushGrabber(fps=100)
     grabber.put(np.zeros((96, 128, 3), np.uint8), 0)
     grabber.open()
     grabber.grab()
+    with pytest.raises(
+        live.SignalLost, match=r"for 0\.02 s"
+    ):  # two frames: one each 6 s was away before each
+        grabber.grab()
     grabber.begin_closing()
     with ThreadPoolExecutor(1) as pool:
         grabbing = pool.submit(grabber.grab)
