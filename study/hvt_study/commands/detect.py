@@ -74,9 +74,8 @@ def write_sheet(path: Path, findings: Sequence[Finding]) -> None:
         return
     read = lru_cache(maxsize=1)(read_image)
     cells = np.zeros((-(-len(worst) // _CELLS_ACROSS) * _CELLS_ACROSS, *_CELL_SHAPE), np.uint8)
-    for place in sorted(
-        range(len(worst)), key=lambda place: worst[place].picture.path
-    ):  # each is opened once
+    # Those of one picture one after the other: each is opened once.
+    for place in sorted(range(len(worst)), key=lambda place: worst[place].picture.path):
         picture = worst[place].picture
         image = read(picture.path, picture.labelled_size)
         assert image is not None, "it was detected on"
