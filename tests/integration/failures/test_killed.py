@@ -100,6 +100,11 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight
         other = link.edge(*edge, "--edge-id", "uav-2", "--max-frames", "40", name="uav-2")
         sent = other.finish()
         flown(len(left) + 3)
+
+        def read() -> bool:
+            return {one.name for one in left} <= {one.file for one in read_index(flights) if one.whole}
+
+        eventually(read, what="the index has read what the killed ground left")
         again.stop(signal.SIGHUP)
         assert steady.alive, steady.said
         steady.stop(signal.SIGHUP)
