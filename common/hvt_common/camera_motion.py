@@ -41,7 +41,10 @@ class SceneChange:
 
     def take(self, image: Image) -> bool:
         """Whether this picture, BGR or gray, has nothing to do with the one just before."""
-        small = _thumbnail(image)
+        # Fractions of a level: rounded means of thousands of pixels would be a flat scene's only contrast.
+        halfway = cv2.resize(image, _HALFWAY_PX, interpolation=cv2.INTER_AREA).astype(np.float32)
+        thumbnail = cv2.resize(halfway, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA)
+        small = np.asarray(thumbnail, np.float32).ravel()
         level = small.mean()
         here, before = small - level, self._before
         self._before = here, level
@@ -61,12 +64,6 @@ def _alike(here: _Thumbnail, there: _Thumbnail) -> float:
     # Correlation, less where one has far more contrast than the other: Lin's concordance, without means.
     energy = float(here @ here + there @ there)
     return 2 * float(here @ there) / energy if energy else 1.0
-
-
-def _thumbnail(image: Image) -> _Thumbnail:
-    # Fractions of a level: rounded means of thousands of pixels would be a flat scene's only contrast.
-    halfway = cv2.resize(image, _HALFWAY_PX, interpolation=cv2.INTER_AREA).astype(np.float32)
-    return np.asarray(cv2.resize(halfway, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA), np.float32).ravel()
 
 
 Affine = npt.NDArray[np.float64]

@@ -83,7 +83,7 @@ class Commands:
         self._commands: dict[str, Callable[[Arguments], ControlAnswer]] = {
             Command.KEYFRAME: self._keyframe,
             Command.STILL: self._still,
-            Command.STILL_OUTCOME: self._still_outcome,
+            Command.STILL_OUTCOME: lambda of: self._answer(note=self.chooser.on_demand.outcome(of["ask"])),
             Command.TRACKS: self._tracks,
             Command.SET_BUDGET: self._set_budget,
             Command.SET_METHOD: self._set_method,
@@ -149,9 +149,6 @@ class Commands:
     def _still(self, arguments: Arguments) -> ControlAnswer:
         number, frame_index = self.chooser.on_demand.request(_on_demand_request(arguments))
         return self._answer(still_request=number, frame_index=frame_index)
-
-    def _still_outcome(self, arguments: Arguments) -> ControlAnswer:
-        return self._answer(note=self.chooser.on_demand.outcome(arguments["ask"]))
 
     def _tracks(self, _arguments: Arguments) -> ControlAnswer:
         frame_index, tracks, there = self.chooser.on_demand.tracks()

@@ -152,11 +152,6 @@ def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
     return next((names for names in found if names is not None), None)
 
 
-def numbered_names(names: Mapping[int, str]) -> tuple[str, ...]:
-    """Names by number, from 0 on; a number that has none is "class" and that number."""
-    return tuple(names.get(number, f"class {number}") for number in range(max(names, default=-1) + 1))
-
-
 def first_synonym(label: str) -> str:
     """The first of comma-separated synonyms: ``beach wagon, station wagon, …`` is shown as ``beach wagon``."""
     return label.partition(",")[0].strip() or label
@@ -208,7 +203,7 @@ def table_names(value: object) -> tuple[str, ...] | None:
         numbers = {int(key): name for key, name in value.items() if re.fullmatch(r"\d{1,6}", str(key))}
         if len(numbers) < len(value) or max(numbers, default=MAX_LABELS) >= MAX_LABELS:
             return None
-        value = numbered_names(numbers)
+        value = [numbers.get(number, "") for number in range(max(numbers, default=-1) + 1)]
     if not isinstance(value, list | tuple) or not 0 < len(value) <= MAX_LABELS:
         return None
     known = ("" if item is None else str(item)[:MAX_LABEL_CHARS] for item in value)

@@ -215,10 +215,6 @@ class Ledger:
         bits = {name: round(line * 8 * 1e9 / self.window_ns) for name, line in windows.worst.items()}
         return WindowRates(base=bits["base"], roi=bits["roi"], total=bits["total"])
 
-    def mean_bps(self, duration_s: float) -> int:
-        """Line bits a second, of everything; ``duration_s`` as of `summary`."""
-        return _rate(self.line_bytes, duration_s)
-
     def summary(self, duration_s: float) -> LedgerSummary:
         """The account; ``duration_s`` is the length of the stream: last minus first frame, plus one interval."""
         return LedgerSummary(
@@ -228,7 +224,7 @@ class Ledger:
             messages={channel.value: number for channel, number in self._messages.items()},
             base_bps=_rate(self._line[Account.BASE], duration_s),
             roi_bps=_rate(self._line[Account.ROI], duration_s),
-            total_bps=self.mean_bps(duration_s),
+            total_bps=_rate(self.line_bytes, duration_s),
             worst_window_bps=self.worst_window_bps,
             outcomes={outcome: dict(reasons) for outcome, reasons in self._outcomes.items()},
         )

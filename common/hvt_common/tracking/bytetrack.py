@@ -259,12 +259,9 @@ class ByteTracker:
         # Where each look comes later than the buffer is long, nothing would be remembered from one to the next.
         return max(self._gaps) > self._buffer_frames + 1
 
-    @property
-    def _lost_frames(self) -> int:
-        return _LEAST_DETECTIONS * max(self._gaps) if self._is_slow else self._buffer_frames
-
     def _mark_over_time(self, frame_index: int) -> None:
-        table, oldest = self._table, frame_index - self._lost_frames - 1
+        lost_frames = _LEAST_DETECTIONS * max(self._gaps) if self._is_slow else self._buffer_frames
+        table, oldest = self._table, frame_index - lost_frames - 1
         if np.minimum.reduce(table.seen, initial=oldest) < oldest:
             late = ((table.phase == LOST) & (table.seen < oldest)).nonzero()[0]
             table.phase[late] = OVER_TIME

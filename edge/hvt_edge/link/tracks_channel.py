@@ -9,7 +9,6 @@ from typing import Final
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import TrackStepEncoder
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Tracks
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
@@ -46,9 +45,10 @@ class TrackReporter:
         capture_ns = seen.frame.capture_ns
         if not seen.detected or not self._due(capture_ns):
             return False
-        tracks = _fresh(seen.tracks, most_frames=self.fresh_frames)
+        tracks = seen.tracks
+        fresh = tracks.frame_index - tracks.seen_frames <= self.fresh_frames
         encoder = copy(self._encoder)  # the next step builds on the last one that was sent
-        step = encoder.encode(tracks, capture_ns=capture_ns)
+        step = encoder.encode(tracks.take(fresh), capture_ns=capture_ns)
         if not self.sender.metadata(
             Channel.TRACKS,
             lambda at_ns: replace(step, send_delay_ns=at_ns - capture_ns).pack(),
@@ -63,8 +63,3 @@ class TrackReporter:
             return True
         pause_s = max(1 / self.most_per_s, 8 * self._last_bytes / self.most_bps)
         return capture_ns - self._last_ns >= SECOND_NS * pause_s * _EARLY
-
-
-def _fresh(tracks: Tracks, *, most_frames: int) -> Tracks:
-    fresh = tracks.frame_index - tracks.seen_frames <= most_frames
-    return tracks if fresh.all() else tracks.take(fresh)

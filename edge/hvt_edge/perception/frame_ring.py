@@ -146,7 +146,8 @@ class FrameRing:
         """The stored frame of the nearest index; None where the index is older than the ring, or yet to come."""
         with self._lock:
             frames = self._held(tracked=tracked)
-            if not frames or not frames[0].frame_index <= frame_index <= self._last_index:
+            come = [one.frame_index for one in (self._captured, *self._frames[-1:]) if one is not None]
+            if not frames or not frames[0].frame_index <= frame_index <= max(come):
                 return None
             near = min(frames, key=lambda one: abs(one.frame_index - frame_index))
             return _nearest(frames, lambda one: abs(one.capture_ns - near.capture_ns))
@@ -158,11 +159,6 @@ class FrameRing:
             bool(frames) and newest is not None and newest.capture_ns - frames[-1].capture_ns <= _UNCODED_NS
         )
         return frames if tracked or near or newest is None else [*frames, newest]
-
-    @property
-    def _last_index(self) -> int:
-        newest = (self._captured, *self._frames[-1:])
-        return max(one.frame_index for one in newest if one is not None)
 
     def _stands_for(self, uncoded: RingFrame) -> bool:
         before = self._frames[-2] if len(self._frames) > 1 else None

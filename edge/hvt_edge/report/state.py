@@ -243,12 +243,14 @@ class Heartbeat:
         came_ns = counts.newest_came_ns
         silent_s = None if came_ns is None else max(0.0, (now_ns - came_ns) / SECOND_NS)
         lockstep = config.pace == "lockstep"
+        # Twice the time between two detections, which wait for frames that are coded.
+        frames = max(analyzer.detect_every, now.decimation)
         age_s, slow = boxes_age_s(
             analyzer.detected_ns,
             newest_ns=self.loop_clock() if lockstep else came_ns,
             resumed_ns=counts.resumed_ns,
             silent=not lockstep and (silent_s or 0.0) > _patience_s(config.nominal_fps),
-            usual_s=self._usual_age_s(),
+            usual_s=max(_LEAST_OLD_S, 2 * frames / config.nominal_fps),
         )
         return EdgeState(
             at_ns=now_ns,
@@ -298,11 +300,6 @@ class Heartbeat:
             backlog=None if self.backlog is None else _backlog(self.backlog),
             failed=self.failures.now,
         )
-
-    def _usual_age_s(self) -> float:
-        # Twice the time between two detections, which wait for frames that are coded.
-        frames = max(self.stills.analyzer.detect_every, self.operating.now.decimation)
-        return max(_LEAST_OLD_S, 2 * frames / self.config.nominal_fps)
 
     def _bps(self, account: Account | None) -> float | None:
         if not self.counts.encoded:

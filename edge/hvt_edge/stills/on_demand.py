@@ -335,15 +335,12 @@ class OnDemand:
         except foreign() as error:  # a requester waits for an answer
             failed = RefusedError(f"it could not be coded ({reason_of(error)})")
             refused = error if isinstance(error, RefusedError) else failed
-            self._give_up(pending, str(refused), now_ns=now_ns)
+            self.line.want_requested(None, now_ns=now_ns)
+            self.outbox.give_up(pending)
+            self._note(pending.number, refusal=str(refused))
             return False
         self._note(pending.number, note=note)
         return True
-
-    def _give_up(self, pending: OnDemandStill, reason: str, *, now_ns: int) -> None:
-        self.line.want_requested(None, now_ns=now_ns)
-        self.outbox.give_up(pending)
-        self._note(pending.number, refusal=reason)
 
     def expired(self, pending: OnDemandStill, reason: str, *, now_ns: int) -> None:
         """It was given up: ``stale`` or ``ended``."""

@@ -63,7 +63,10 @@ def code_requested(job: Still, *, codec: StillCodec, capacity: Capacity) -> tupl
     wanted = tries.at(job.header.quality_pct)
     best = None
     for limit_bytes in (capacity.prompt_bytes, capacity.most_bytes):
-        best = best or _as_good(tries, wanted, limit_bytes) or _lower(tries, wanted, limit_bytes)
+        best = best or _as_good(tries, wanted, limit_bytes)
+        if best is None and wanted.size_bytes > limit_bytes:
+            # Below the requested quality, if that still beats the base.
+            best = _fitting(tries, wanted, limit_bytes)
     best = best or _shrunk(job, codec, capacity.most_bytes, wanted=wanted)
     if best is None:
         raise RefusedError(_refusal(tries, wanted, capacity))
@@ -85,13 +88,6 @@ def _as_good(tries: Codings, wanted: Coding, limit_bytes: int) -> Coding | None:
         if tries.gain_db(one) >= _PLAIN_GAIN_DB:
             break
     return best if _beats_base(tries, best) else None
-
-
-def _lower(tries: Codings, wanted: Coding, limit_bytes: int) -> Coding | None:
-    # Below the requested quality, if that still beats the base.
-    if wanted.size_bytes <= limit_bytes:
-        return None
-    return _fitting(tries, wanted, limit_bytes)
 
 
 def _fitting(tries: Codings, wanted: Coding, limit_bytes: int) -> Coding | None:

@@ -91,8 +91,9 @@ def choose_base(
     nominal_fps = most_fps if fps is None else fps
     most_n = 1 if fps is not None else most_decimation(most_fps, least_fps=least_fps)
     if size is None:
-        # The rate at the lowest frame rate that is wanted: fewer frames can pay for a larger size.
-        size = _size_for(payload_bps / nominal_fps * min(most_n, 3), source_size)
+        # The largest that a frame's bits fill at the lowest rate wanted: fewer frames can pay for a larger size.
+        frame_bits, sizes = payload_bps / nominal_fps * min(most_n, 3), sizes_of(source_size)
+        size = next((one for one in sizes if frame_bits / (one[0] * one[1]) >= _SIZE_BITS_PER_PX), sizes[-1])
     bits_per_px = payload_bps / nominal_fps / (size[0] * size[1])
     fitting = [n for n in _STEPS if n <= most_n and bits_per_px * n >= _RATE_BITS_PER_PX]
     return size, fitting[0] if fitting else max(n for n in _STEPS if n <= most_n)
@@ -114,13 +115,6 @@ def better_decimation(
 def most_decimation(fps: float, *, least_fps: float = _LEAST_FPS) -> int:
     """The largest n of the ladder that leaves ``least_fps`` of ``fps`` source frames a second."""
     return max((n for n in _STEPS if fps / n >= least_fps), default=1)
-
-
-def _size_for(bits_per_frame: float, source_size: tuple[int, int]) -> tuple[int, int]:
-    # The largest of the ladder that the bits of a frame fill; the smallest where they fill none.
-    sizes = sizes_of(source_size)
-    fitting = [size for size in sizes if bits_per_frame / (size[0] * size[1]) >= _SIZE_BITS_PER_PX]
-    return fitting[0] if fitting else sizes[-1]
 
 
 def sizes_of(source_size: tuple[int, int]) -> list[tuple[int, int]]:

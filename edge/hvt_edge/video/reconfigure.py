@@ -158,13 +158,14 @@ class EncoderReconfiguration:
 
     def __call__(self, decimation: int, now_ns: int) -> Encoder | None:
         """Return the encoder from this keyframe on, or None to keep the present one."""
-        changed = self._take_command()
+        now = self.operating.now
+        before, self._commanded = self._commanded, (now.budget_bps, now.video_share)
+        changed = before != self._commanded  # since the last keyframe
         same_preset = self.presets is None or not self.presets.wants_another(now_ns)
         if self.pacer is not None:
             return self._at_links_rate(
                 self.pacer, decimation, now_ns, changed=changed, same_preset=same_preset
             )
-        now = self.operating.now
         base_bps, total_bps = self._proposed_bps(decimation, changed=changed), now.budget_bps
         if same_preset and not changed and (decimation, base_bps) == (now.decimation, now.base_bps):
             return None
@@ -224,12 +225,6 @@ class EncoderReconfiguration:
     def _moving(self) -> bool:
         # Whether the split tracks the scene; a commanded share stops it.
         return self._commanded[1] is None
-
-    def _take_command(self) -> bool:
-        # Whether another total or share was commanded since the last keyframe; it holds from now on.
-        now = self.operating.now
-        before, self._commanded = self._commanded, (now.budget_bps, now.video_share)
-        return before != self._commanded
 
     def _tell_split(self, decimation: int) -> None:
         assert self.split is not None

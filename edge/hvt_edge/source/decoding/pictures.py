@@ -127,7 +127,9 @@ class Pictures:
         turn = _turn_of(frame) or self._held_turn or _UPRIGHT
         if said := _TURNS[turn]:
             self.say(f"it is to be shown {said}, and is")
-            picture = _turned(picture, turn)
+            swap, mirror, flip = turn
+            picture = np.swapaxes(picture, 0, 1) if swap else picture
+            picture = picture[:: -1 if flip else 1, :: -1 if mirror else 1]
         return np.ascontiguousarray(picture)
 
     def _upright_colours(self, frame: av.VideoFrame) -> Image:
@@ -228,12 +230,6 @@ def _turn_of(frame: av.VideoFrame) -> _Turn | None:
     if abs(b) + abs(c) > abs(a) + abs(d):
         return True, c < 0, b < 0
     return False, a < 0, d < 0
-
-
-def _turned(picture: Image, turn: _Turn) -> Image:
-    swap, mirror, flip = turn
-    turned = np.swapaxes(picture, 0, 1) if swap else picture
-    return turned[:: -1 if flip else 1, :: -1 if mirror else 1]
 
 
 _LOW_PCT, _HIGH_PCT = 0.5, 99.5

@@ -49,7 +49,8 @@ class CameraPath:
 
     def _between(self, start: int, end: int) -> Affine:
         if start > end:
-            return np.asarray(np.linalg.inv(_whole(self._between(end, start)))[:2], np.float64)
+            back = np.vstack((self._between(end, start), [0.0, 0.0, 1.0]))
+            return np.asarray(np.linalg.inv(back)[:2], np.float64)
         whole = np.eye(3)
         for first, last, step in self._steps:
             shared = min(end, last) - max(start, first)
@@ -73,10 +74,6 @@ class CameraPath:
         centres = (boxes[:, :2] + boxes[:, 2:]) / 2 @ affine[:, :2].T + affine[:, 2]
         halves = (boxes[:, 2:] - boxes[:, :2]) / 2 * np.sqrt(abs(np.linalg.det(affine[:, :2])))
         return np.concatenate((centres - halves, centres + halves), axis=1)
-
-
-def _whole(affine: Affine) -> _Floats:
-    return np.vstack((affine, [0.0, 0.0, 1.0]))
 
 
 def _part(step: _Floats, share: float) -> _Floats:

@@ -132,14 +132,10 @@ class StillStage:
                 if known is not None:
                     self.fusion.take_found(readings.found, known=known)
 
-    def _out_of_patience(self, now: Progress) -> bool:
-        # Sent on purpose, then: each costs a line in the recording and, from libjpeg, one on stderr.
-        spoilt = self._spoilt
-        return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_FRAMES
-
     def _decode(self, still: ReceivedStill, now: Progress) -> DecodedStill | None:
-        header = still.header
-        if self._out_of_patience(now):
+        header, spoilt = still.header, self._spoilt
+        # Sent on purpose, then: each costs a line in the recording and, from libjpeg, one on stderr.
+        if len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_FRAMES:
             self.dropped["undecodable"] += 1
             self._answer(header, header.track_id, None)
             return None
