@@ -240,27 +240,19 @@ def _merged(parts: list[Detections], truncated: npt.NDArray[np.bool_]) -> Detect
     chosen = whole[
         suppress(boxes[whole], scores[whole], class_ids[whole], iou=_SAME_IOU, any_class_iou=_ANY_CLASS_IOU)
     ]
-    chosen = chosen[_outermost(boxes[chosen], class_ids[chosen])]
+    # Of these, best first, those that do not lie in a better one of their class, nor hold one.
+    inside = shared_of_smaller(boxes[chosen], boxes[chosen]) > _INSIDE
+    inside &= class_ids[chosen, None] == class_ids[None, chosen]
+    chosen = chosen[_first_come(inside)]
     partial = np.flatnonzero(truncated)
     partial = partial[np.argsort(-scores[partial], kind="stable")][:MAX_DETECTIONS]
-    partial = partial[_uncovered(boxes[partial], boxes[chosen])]
+    # Of truncated ones, best first, those that neither the others nor a better one cover by half.
+    partial = partial[~(shared_of_smaller(boxes[partial], boxes[chosen]) > _COVERED).any(axis=1)]
+    partial = partial[_first_come(shared_of_smaller(boxes[partial], boxes[partial]) > _COVERED)]
     joined, best = _joined(boxes[partial], class_ids[partial])
     chosen, boxes = np.concatenate((chosen, partial[best])), np.concatenate((boxes[chosen], joined))
     order = np.argsort(-scores[chosen], kind="stable")[:MAX_DETECTIONS]
     return Detections(boxes[order], scores[chosen][order], class_ids[chosen][order])
-
-
-def _outermost(boxes: Boxes, class_ids: npt.NDArray[np.int32]) -> npt.NDArray[np.intp]:
-    # Of boxes, best first, those that do not lie in a better one of their class, nor hold one.
-    inside = shared_of_smaller(boxes, boxes) > _INSIDE
-    inside &= class_ids[:, None] == class_ids[None, :]
-    return _first_come(inside)
-
-
-def _uncovered(partial: Boxes, others: Boxes) -> npt.NDArray[np.intp]:
-    # Of truncated boxes, best first, those that neither the others nor a better one cover by half.
-    free = np.flatnonzero(~(shared_of_smaller(partial, others) > _COVERED).any(axis=1))
-    return free[_first_come(shared_of_smaller(partial[free], partial[free]) > _COVERED)]
 
 
 def _joined(partial: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, npt.NDArray[np.intp]]:

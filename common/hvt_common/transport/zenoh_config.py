@@ -156,7 +156,11 @@ def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
         return zenoh.Config.from_json5(text), said
     except zenoh.ZError as error:
         reason = without_build_paths(str(error))
-        raise UserError(f"{what}{_line_of(reason, text)} is not accepted by Zenoh: {reason}") from None
+        # ``:LINE`` of the field or value that the reason quotes, where it stands in the file only once.
+        found = re.search(r"`(\w+)`", reason)
+        lines = [number for number, line in enumerate(text.splitlines(), 1) if found and found[1] in line]
+        where = f":{lines[0]}" if len(lines) == 1 else ""
+        raise UserError(f"{what}{where} is not accepted by Zenoh: {reason}") from None
 
 
 def _mentions(said: dict[str, Any], path: str) -> bool:
@@ -262,13 +266,6 @@ def without_build_paths(text: str) -> str:
 def _located(text: str) -> tuple[str, str]:
     found = re.match(r"<string>:(\d+) (.*)", text, re.DOTALL)
     return (f":{found[1]}", " ".join(found[2].split())) if found else ("", " ".join(text.split()))
-
-
-def _line_of(reason: str, text: str) -> str:
-    # ``:LINE`` of the field or value that Zenoh's reason quotes, where it stands in the file only once.
-    found = re.search(r"`(\w+)`", reason)
-    lines = [number for number, line in enumerate(text.splitlines(), 1) if found and found[1] in line]
-    return f":{lines[0]}" if len(lines) == 1 else ""
 
 
 def end_of(locator: object) -> str:

@@ -239,7 +239,9 @@ class RateController:
 
     def on_progress(self, progress: Progress) -> None:
         """Process one report that names a message for the first time."""
-        step_ns = self._elapsed(progress.now_ns)
+        # Bounded: a report after a long pause must not make the rate leap.
+        step_ns = 0 if self._last_ns is None else min(max(0, progress.now_ns - self._last_ns), 500 * _MS)
+        self._last_ns = progress.now_ns
         excess_ns = self._excess(progress)
         if progress.sent_ns < self._judge_from_ns:
             return
@@ -300,12 +302,6 @@ class RateController:
         self._least = LeastDelay()
         self._recent.clear()
         self._losses.clear()
-
-    def _elapsed(self, now_ns: int) -> int:
-        # Time since the last report, bounded: a report after a long pause must not make the rate leap.
-        step_ns = 0 if self._last_ns is None else min(max(0, now_ns - self._last_ns), 500 * _MS)
-        self._last_ns = now_ns
-        return step_ns
 
     def _excess(self, progress: Progress) -> int:
         delay_ns = progress.arrived_ns - progress.sent_ns

@@ -105,11 +105,6 @@ def _gaps(files: list[Path]) -> str:
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
-def _below(folder: Path) -> str:
-    found = sorted({file.parent.name for file in folder.glob("[!._]*/*") if names_picture(file)})
-    return f" of its own, its folder {found[0]!r:.80} does" if found else ""
-
-
 def _bands(files: list[Path]) -> Counter[str]:
     # Cameras of several bands number these behind a picture's number: IMG_0001_1 to IMG_0001_5. Of other names none.
     parts = [re.fullmatch(r"(.*[0-9])_([0-9])", file.stem) for file in files]
@@ -168,9 +163,9 @@ class FolderSource(Source):
         self._files = sequence_files(self._place)
         if not self._files:
             endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
-            raise UserError(
-                f"source folder {spec!r} holds no images{_below(self._place)}; accepted endings are {endings}"
-            )
+            below = sorted({file.parent.name for file in self._place.glob("[!._]*/*") if names_picture(file)})
+            hint = f" of its own, its folder {below[0]!r:.80} does" if below else ""
+            raise UserError(f"source folder {spec!r} holds no images{hint}; accepted endings are {endings}")
         notes = Notes(spec)
         self._stretch = Stretch(notes)
         images = ((read_picture(file, self._stretch), file) for file in self._files)

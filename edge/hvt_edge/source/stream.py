@@ -321,7 +321,10 @@ def _open(url: str, *, open_s: float, read_s: float) -> Any:
             # by their own beginnings.
             with suppress(av.error.FFmpegError, OSError):
                 return _pictures_of(av.open(url, format="mjpeg", **how), name)
-    raise kind(f"source {name} cannot be opened within {open_s:g} s ({cause}){_spelt(url)}")
+    # A password was probably misread as part of the address.
+    odd = set("/?#[]") & set(url.partition("://")[2].rpartition("@")[0])
+    spelt = "; in a password write / ? # [ ] as %2F %3F %23 %5B %5D" if odd else ""
+    raise kind(f"source {name} cannot be opened within {open_s:g} s ({cause}){spelt}")
 
 
 def _pictures_of(container: Any, name: str) -> Any:
@@ -334,10 +337,3 @@ def _pictures_of(container: Any, name: str) -> Any:
         return container
     container.close()
     raise OSError
-
-
-def _spelt(url: str) -> str:
-    # How to write a password that was probably misread as part of the address; empty where there is none.
-    body = url.partition("://")[2]
-    odd = set("/?#[]") & set(body.rpartition("@")[0])
-    return "; in a password write / ? # [ ] as %2F %3F %23 %5B %5D" if odd else ""

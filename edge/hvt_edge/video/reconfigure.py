@@ -352,12 +352,9 @@ class Split:
             return 0.0
         wanted = 8 * self._need_bytes / self.horizon_s / self.total_bps
         wanted = min(self.most_still_share, max(self.least_still_share, wanted))
-        return max(0.0, min(wanted, 1 - self._metadata_share() - self._floor_bps() / self.total_bps))
-
-    def _floor_bps(self) -> float:
         # The least for the base: the more of the objects it shows by itself, the higher.
-        least = self.least_base_bps
-        return least + self._shown * max(0, self.visible_base_bps - least)
+        floor_bps = self.least_base_bps + self._shown * max(0, self.visible_base_bps - self.least_base_bps)
+        return max(0.0, min(wanted, 1 - self._metadata_share() - floor_bps / self.total_bps))
 
     def _metadata_share(self) -> float:
         return self.metadata_bps / self.total_bps
