@@ -234,7 +234,7 @@ _MOST_BEHIND_NS = 2 * SECOND_NS
 _MOST_SET_NS = SECOND_NS
 """The same where the stamps go back: the camera's clock was set."""
 _OFTEN = 3
-"""Stamps that fell behind so often do not count for a minute."""
+"""Stamps that fell behind so often, each time within half a minute of the last, do not count for a minute."""
 _PROOF_NS, _NEAR_NS = 10 * SECOND_NS, SECOND_NS // 10
 """Stamps that come this near to the least delay after this time count the same second as we do: …"""
 _HELD_NS = 10 * SECOND_NS
@@ -262,8 +262,8 @@ class CameraClock:
         self._since_ns = self._begun_ns = 0
         """When the present least delay was begun, and when the first for the stamps as they count now."""
         self._proven = False
-        self._fell_behind = self._unused_ns = 0
-        """How often its stamps did, and never caught up; until when they do not count for it."""
+        self._fell_behind = self._behind_ns = self._unused_ns = 0
+        """How often its stamps did lately, when last, and until when they do not count for it."""
         self._late_ns = self._held_ns = self._fell_ns = 0
         """How late the last frame was, the least of those that are held back for long, and when that was found."""
         self._recent: deque[int] = deque(maxlen=_RECENT)
@@ -311,7 +311,8 @@ class CameraClock:
                 return True
             return False
         if self._held_ns == 0 and not leaps:
-            self._fell_behind += 1
+            soon = now_ns - max(self._behind_ns, self._unused_ns) < _MEMORY_NS // 2
+            self._fell_behind, self._behind_ns = self._fell_behind * soon + 1, now_ns
             if self._fell_behind >= _OFTEN:  # no queue that grew: most frames would seem to come too early
                 self._unused_ns = now_ns + _MEMORY_NS
             return True

@@ -92,7 +92,7 @@ class Gate:
     def wanted(self, count: int, *, before_ns: int) -> int:
         """How many of ``count`` frames were due that did not come before the one of that time."""
         due_ns = before_ns if self._due_ns is None else self._due_ns
-        return min(count, max(0, (before_ns - due_ns) // self._period_ns))
+        return min(count, max(0, (before_ns + self._early_ns - due_ns) // self._period_ns))
 
 
 class Resizer:

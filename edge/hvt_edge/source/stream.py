@@ -56,6 +56,8 @@ _PLAYLIST = ".m3u8"
 _BEHIND_S, _MOST_STEP_S = 1.0, 1
 _WINDOW_S, _WAITS_SHARE = 1.0, 0.1
 """Who has waited for packets for a tenth of the last second has none that wait for him."""
+_GROWS, _KNOWN_S = 5, 60.0
+"""Who falls behind in so many seconds in a row is too slow; for a minute after that one is enough."""
 _MOST_LATE_S, _MOST_EARLY_S = 0.5, 1.0
 """A packet later or earlier than this sets the time for the next ones: after a stall, or a jump of the stamps."""
 _OPTIONS = {
@@ -170,7 +172,7 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
             damaged = None if damaged is None else damaged + is_picture_each(stream)
         if decoder.patched:
             pictures.say("damaged pictures come, shown as the decoder has patched them")
-        if decoded:
+        if decoded or left_out:
             until_s = time.monotonic() + _UNDECODED_S
         elif time.monotonic() > until_s:
             raise SignalLost(NO_PICTURE)
@@ -194,12 +196,13 @@ def _note_gap(stream: Any, pictures: Pictures) -> None:
 
 
 def _in_time(packets: Iterator[Any], note_gap: Callable[[], None]) -> Iterator[tuple[Any, int]]:
-    # Each packet, and how many were left out before it: those up to a keyframe, once decoding is a second behind
-    # them. They would wait longer and longer, and be called live: to `CameraClock` a queue that grows looks like
-    # stamps that count another second.
-    late_s = waited_s = 0.0
-    left_out = count = between = 0
+    # Each packet, and how many were left out before it. Where decoding falls behind for seconds, those up to a
+    # keyframe are: they would wait longer and longer, and be called live (to `CameraClock` a queue that grows looks
+    # like stamps that count another second). After one stall it catches up, and nothing is left out.
+    late_s = was_late_s = waited_s = 0.0
+    grew = left_out = count = between = 0
     requested_s = since_s = before_s = time.monotonic()
+    known_s = -math.inf
     before_at: Fraction | None = None
     for packet in packets:
         now_s, at = time.monotonic(), None if packet.dts is None else packet.dts * packet.time_base
@@ -209,16 +212,23 @@ def _in_time(packets: Iterator[Any], note_gap: Callable[[], None]) -> Iterator[t
         before_s, before_at = now_s, at
         if now_s - since_s > _WINDOW_S:
             late_s *= waited_s < _WAITS_SHARE * (now_s - since_s)
-            waited_s, since_s = 0.0, now_s
+            grew = grew + 1 if late_s > was_late_s else 0
+            was_late_s, waited_s, since_s = late_s, 0.0, now_s
         count += 1
         if packet.is_keyframe:
             between, count = count, 0
-        behind = late_s > (_BEHIND_S / 2 if left_out else _BEHIND_S)
-        # A film that is refreshed without keyframes is decoded whole.
-        if (behind or (left_out and not packet.is_keyframe)) and count < 2 * between:
-            note_gap()
+        if left_out:
+            leave = not packet.is_keyframe or late_s > _BEHIND_S / 2
+        else:  # a film that is refreshed without keyframes is decoded whole
+            slow = grew >= (1 if now_s - known_s < _KNOWN_S else _GROWS)
+            leave = slow and late_s > _BEHIND_S and count < 2 * between
+        if leave:
             left_out += 1
         else:
+            if left_out:
+                note_gap()
+                grew, known_s = 0, now_s
+                was_late_s, waited_s, since_s = late_s, 0.0, now_s
             yield packet, left_out
             left_out = 0
         requested_s = time.monotonic()

@@ -338,6 +338,19 @@ def test_stamps_that_count_another_second_are_not_believed_for_long(fps, stamps)
     assert taken >= 0.95 * 300 * min(fps, 15)
 
 
+def test_a_network_that_holds_frames_back_now_and_then_costs_none():
+    """From the third such time on its stamps counted for nothing for a minute, and bursts lost most of a picture."""
+    clock, gate, lost = CameraClock(), Gate(25), []
+    now_ns = 0
+    for number in range(25 * 1500):
+        at_s = number / 25
+        queued_s = max(0.0, min(at_s % 300 - 200, 25) * 0.1 - max(0.0, at_s % 300 - 245) * 0.8)
+        now_ns = max(now_ns + 1, round((1000 + at_s + queued_s + 0.2 - at_s % 0.2) * SECOND_NS))
+        at_ns = clock.capture_ns(round(at_s * SECOND_NS), now_ns=now_ns)
+        lost += [] if gate.accept(at_ns) else [at_s]
+    assert len(lost) < 0.01 * 25 * 1500
+
+
 class Hangs(SaysItsTimeLater):
     """After its first picture it does not answer."""
 

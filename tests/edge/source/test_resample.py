@@ -109,6 +109,7 @@ def test_of_frames_that_were_left_out_those_count_that_were_due():
     gate.accept(0)
     assert [gate.wanted(count, before_ns=10**9) for count in (60, 5, 0)] == [9, 5, 0]
     assert gate.wanted(60, before_ns=10**8) == 0
+    assert gate.wanted(1, before_ns=2 * 10**8 - 1) == 1, "stamps are rounded"
 
 
 @given(
