@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from hvt_common.inference.class_names import MOVING, same_kind
 from hvt_edge.stills.policy.base import Method, Request, Step, ranked
+from hvt_edge.stills.policy.paper import novelty
 
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
@@ -91,7 +92,7 @@ class ExpectedGain(Method):
 
     def gain(self, candidate: Candidate, step: Step) -> float:
         """Chance that a still now corrects the class that the ground shows, 0…1, plus the worth of its details."""
-        faded = self._faded(candidate, now_ns=step.now_ns)
+        faded = novelty(candidate, now_ns=step.now_ns, time_constant_s=self.fade_s)  # 1 - k
         before = faded * self.doubt(candidate, from_source=step.from_source)
         after = (1 - faded) * self._doubt_left(candidate) * self._better(candidate)
         worth = before + after
@@ -137,12 +138,6 @@ class ExpectedGain(Method):
 
     def _lost(self, candidate: Candidate) -> float:
         return self.unknown_lost if candidate.loss is None else candidate.loss().detail_lost
-
-    def _faded(self, candidate: Candidate, *, now_ns: int) -> float:
-        # ``1 - k``: 1 where nothing was sent yet.
-        if candidate.last_sent_ns is None or self.fade_s <= 0:
-            return 1.0
-        return 1 - math.exp(-max(0, now_ns - candidate.last_sent_ns) / 1e9 / self.fade_s)
 
     def _doubt_left(self, candidate: Candidate) -> float:
         # P(wrong after the last still): ``1 - exp(-H)`` of the ground's entropy, more where the two disagree.
