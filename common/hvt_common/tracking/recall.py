@@ -59,9 +59,10 @@ class Recall:
         there, reports = sum(self._counts.values(), np.zeros(2)).tolist()
         of_all = reports / (there + _CAUTION)
         of_others = np.array([_OTHERS, _OTHERS * of_all])
+        totals = {class_id: (counts + of_others).tolist() for class_id, counts in self._counts.items()}
         self._shares = {
-            class_id: _limited(_share(counts + of_others), before=self.share(class_id))
-            for class_id, counts in self._counts.items()
+            class_id: _limited(reported / there, before=self.share(class_id))
+            for class_id, (there, reported) in totals.items()
         }
         self._share_of_others = _limited(of_all, before=self._share_of_others)
 
@@ -79,11 +80,6 @@ class Recall:
         found = min(max(confidence, 0.0), 1.0)
         there = found * (1 - self.share(class_id))
         return there / max(there + 1 - found, 1e-9)
-
-
-def _share(counts: npt.NDArray[np.float64]) -> float:
-    there, reports = counts.tolist()
-    return float(reports / there)
 
 
 def _limited(share: float, *, before: float) -> float:
