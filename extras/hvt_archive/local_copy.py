@@ -67,7 +67,7 @@ class LocalCopy:
         """Write the queue and the index, and end the thread; a card that hangs is left behind."""
         with contextlib.suppress(queue.Full):
             self._queue.put(None, timeout=_CLOSE_S)
-        if not joined(self._thread, within_s=_CLOSE_S):
+        if not joined(self._thread, left=self._queue.qsize, within_s=_CLOSE_S):
             self._failures.failed(_PART, f"{self._path} did not take the last frames within {_CLOSE_S:g} s")
 
     def __enter__(self) -> Self:

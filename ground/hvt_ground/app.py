@@ -31,6 +31,7 @@ from hvt_ground.events import Event
 from hvt_ground.extras import Service, extras_of, part_of
 from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
+from hvt_ground.session import edge_sessions
 from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
@@ -262,7 +263,7 @@ class Ground:
                 if not again:
                     parts.models.give_up()
             finally:
-                self._close_edges()
+                edge_sessions.join([*self._edges.values(), *self._leaving])
             self._raise_error()
         return again
 
@@ -382,13 +383,6 @@ class Ground:
     def _waited(self) -> bool:
         waits_s = max(self._config.wait, _BACK_WITHIN_S * self._anew)
         return 0 < waits_s < time.monotonic() - self._began_s
-
-    def _close_edges(self) -> None:
-        # Several finish in the time of one.
-        for one in self._edges.values():
-            one.stop()
-        for one in (*self._edges.values(), *self._leaving):
-            one.join()
 
     def _raise_error(self) -> None:
         for one in (*self._edges.values(), *self._leaving):

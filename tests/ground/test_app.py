@@ -21,6 +21,7 @@ from hvt_ground import app
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import Extra, Service
+from hvt_ground.session import edge_sessions
 from hvt_ground.session.edge_sessions import EdgeSessions
 from programs.outsider import joined
 from programs.processes import eventually
@@ -266,7 +267,7 @@ def test_a_session_that_hangs_at_the_end_is_said(
     states, hung = list[Any](), threading.Event()
     service.show = states.append
     monkeypatch.setattr(EdgeSessions, "close", lambda _: hung.wait())
-    monkeypatch.setattr(EdgeSessions, "join", EdgeSessions.stop)
+    monkeypatch.setattr(edge_sessions, "join", lambda edges: [one.stop() for one in edges])
     run = Run(config(free_port, tmp_path))
     try:
         with joined(f"tcp/127.0.0.1:{free_port}") as outsider, outsider.liveliness().declare_token(ALIVE):

@@ -33,9 +33,6 @@ _END_SLOWLY_WITHIN_S = 30.0
 """For a run of which no part hangs: the disk of its files may be slow. Those of deploy/ kill it after 40 s."""
 _WORK_WITHIN_S = 20.0
 
-_CLOCK_OF_THREAD = 6
-"""Linux's posix-timers.h: the time that a scheduler gave to one thread."""
-
 # Parameters of mallopt, glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
@@ -96,31 +93,21 @@ def ended_in_time(
     return done.result()
 
 
-def joined(*threads: threading.Thread, within_s: float) -> bool:
-    """Wait for their end; False where all that are left stand still for ``within_s``, or they work for 20 s.
+def joined(*threads: threading.Thread, left: Callable[[], int], within_s: float) -> bool:
+    """Wait for their end; False once ``left()``, their items, has not changed for ``within_s``, or after 20 s.
 
-    On a busy machine a thread of low priority has a moment now and then; in one that hangs nothing ever moves.
-    Only on Linux can that be told: elsewhere it ends within ``within_s``.
+    On a busy machine a thread gets on slowly. One that hangs takes no item any more, even where it polls.
     """
     began_s = moved_s = now_s = time.monotonic()
-    before: list[int] = []
-    while left := [one for one in threads if one.is_alive()]:
-        worked = [worked_ns(one) for one in left]
-        if worked != before:
-            before, moved_s = worked, now_s
+    before = -1
+    while alive := [one for one in threads if one.is_alive()]:
+        if (items := left()) != before:
+            before, moved_s = items, now_s
         if (until_s := min(moved_s + within_s, began_s + max(within_s, _WORK_WITHIN_S))) <= now_s:
             return False
-        left[0].join(min(until_s - now_s, _CHECK_EVERY_S))
+        alive[0].join(min(until_s - now_s, _CHECK_EVERY_S))
         now_s = time.monotonic()
     return True
-
-
-def worked_ns(thread: threading.Thread) -> int:
-    """The time for which a thread has had a processor; 0 where the system does not tell, or it has ended."""
-    # Python's own call for that clock crashes where the thread has just ended.
-    with contextlib.suppress(OSError):
-        return time.clock_gettime_ns(~(thread.native_id or 0) << 3 | _CLOCK_OF_THREAD)
-    return 0
 
 
 def interrupt_on_signals() -> None:

@@ -305,7 +305,7 @@ class StoreWorker:
     def close(self) -> None:
         """Write the queue, close the file, join the thread. A disk that hangs costs the queue, and a warning."""
         self.intake.signal(closed=True)
-        if not joined(self._thread, within_s=self._close_s):
+        if not joined(self._thread, left=self.intake.__len__, within_s=self._close_s):
             _log.warning(
                 "the disk of --store-folder takes longer than %g s: %d frames and stills that wait for it are not "
                 "stored",

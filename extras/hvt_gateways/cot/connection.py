@@ -31,7 +31,6 @@ with warnings.catch_warnings():
 from hvt_common.errors import UserError, absent
 from hvt_common.files import read_bytes
 from hvt_common.runtime.host_names import is_group
-from hvt_common.runtime.process import joined
 from hvt_gateways.cot.event import CotMessage
 from hvt_ground.sinks import SinkWriter
 
@@ -189,7 +188,7 @@ class CotConnection(SinkWriter[CotMessage]):
             if hurry is not None and hurry.is_set():
                 self._unsent.clear()
         self._notify()
-        joined(self._thread, within_s=2 * END_S)
+        self._thread.join(2 * END_S)
 
     def _notify(self) -> None:
         with suppress(RuntimeError):  # the loop has ended, and `_error` says why

@@ -16,7 +16,7 @@ from contextlib import closing
 
 from hvt_common.errors import foreign
 from hvt_common.runtime.failures import reason_of
-from hvt_common.runtime.process import joined, lower_priority
+from hvt_common.runtime.process import lower_priority
 from hvt_common.values import Tracks
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 
@@ -210,10 +210,10 @@ class RealtimeWorker(_Worker):
         self._thread.join(self._finish_s)
         self._given_up.set()
         self._wake.set()
-        ended = joined(self._thread, within_s=self._leave_s)
+        self._thread.join(self._leave_s)
         self.dropped["ended"] += len(self._stills)
         self.untracked += len(self._pictures)
-        return ended
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         lower_priority(little=True)  # boxes follow the picture, detection follows them

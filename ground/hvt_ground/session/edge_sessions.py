@@ -124,15 +124,14 @@ class EdgeSessions:
         return self
 
     def stop(self) -> None:
-        """Begin to finish; `join` waits for it. Several threads finish in the time of one."""
+        """Begin to finish; `join` waits for it."""
         if self._stopped_ns is None:
             self._stopped_ns = time.monotonic_ns()
             self.port.inbox.close()
 
     def join(self, *, timeout_s: float = 4.0) -> bool:
-        """Finish arrived messages, close the session, join the thread (`joined`); False where that hangs."""
-        self.stop()
-        return joined(self._thread, within_s=timeout_s)
+        """As `join`, of this one."""
+        return join([self], timeout_s=timeout_s)
 
     @property
     def finished(self) -> bool:
@@ -428,3 +427,11 @@ class EdgeSessions:
             return not self.port.present.is_set() and self.receiver.silent_ns > self._patience_ns
         whole = session.reception.is_whole and not self.backlog.working
         return whole or now_ns - self._ended_ns > self._ended_patience_ns
+
+
+def join(edges: Sequence[EdgeSessions], *, timeout_s: float = 4.0) -> bool:
+    """Finish arrived messages, close sessions, join threads (`joined`) in the time of one; False where one hangs."""
+    for one in edges:
+        one.stop()
+    threads = [one._thread for one in edges]  # noqa: SLF001 - of this module
+    return joined(*threads, left=lambda: sum(len(one.port.inbox) for one in edges), within_s=timeout_s)

@@ -162,7 +162,11 @@ class QueuedSink(Generic[T]):
     def idle(self) -> bool:
         """Whether all that could be written is."""
         with self._changed:
-            return not (self._queue or self._in_hand)
+            return not self._left
+
+    @property
+    def _left(self) -> int:
+        return len(self._queue) + self._in_hand
 
     def is_open(self, *, within_s: float = 0.0) -> bool:
         """Whether an item logged now will be written, as far as is known; waits ``within_s`` for the sink to be made.
@@ -304,11 +308,11 @@ def _join(sinks: Sequence[QueuedSink[Any]], within_s: float) -> None:
     for one in sinks:
         one.close()
     threads = [one._thread for one in sinks]  # noqa: SLF001 - of this module
-    if joined(*threads, within_s=within_s):
+    if joined(*threads, left=lambda: sum(one._left for one in sinks), within_s=within_s):  # noqa: SLF001
         return
     for one in sinks:
         one._hurry.set()  # noqa: SLF001
-    joined(*threads, within_s=1.0)
+    joined(*threads, left=int, within_s=1.0)
     for one in sinks:
         if not one.ended:
             one._fail(UserError("it did not end in time, and what it had yet to write is lost"))  # noqa: SLF001

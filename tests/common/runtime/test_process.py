@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -14,6 +15,7 @@ from hvt_common.runtime import process
 from hvt_common.runtime.process import (
     STOP_SIGNALS,
     give_back_holes,
+    joined,
     limit_malloc_arenas,
     lower_priority,
     stop_on_signals,
@@ -82,6 +84,29 @@ def test_a_program_that_hangs_needs_no_kill(one, within, what, code):
             )  # a terminal that is closed meanwhile ends nothing
             run.send_signal(one)
         assert run.wait(60) == (128 + one if what == "again" else code)
+
+
+def test_parts_that_hang_and_poll_are_given_up_in_the_time_of_one(monkeypatch):
+    """Each look at a driver that never answers counted as work: Ctrl-C took 20 s a part."""
+    over, now_s = threading.Event(), 0.0
+
+    def poll():
+        while not over.wait(0.001):
+            pass
+
+    def monotonic():
+        nonlocal now_s
+        now_s += 1
+        return now_s
+
+    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic=monotonic))
+    threads = [threading.Thread(target=poll) for _ in range(2)]
+    for one in threads:
+        one.start()
+    assert not joined(*threads, left=lambda: 3, within_s=4.0)
+    over.set()
+    assert now_s == 5, "from 1"
+    assert joined(*threads, left=lambda: 0, within_s=1e6)
 
 
 FRAMES = """
