@@ -91,7 +91,8 @@ _BLOCK_LEVELS: Final = 2.0
 _BLOCK_SHARE: Final = 0.85
 """A block speaks for the motion that leaves this share of the other's difference, and that is at least the levels."""
 _LEAST_BLOCKS: Final = 3
-_STANDING_BIAS: Final = 3.0
+_BAR_LEVELS: Final = 12
+_STANDING_BIAS: Final = 2.0
 """A camera that stood needs so many blocks for each that says it still does: it passes for one in traffic."""
 # No camera zooms or rolls this far between two frames: such an estimate is wrong.
 _SCALE_RANGE: Final = (0.5, 2.0)
@@ -220,15 +221,32 @@ def _ways(affine: Affine, image: _Gray) -> npt.NDArray[np.float64]:
 
 def _stands(previous: _Gray, current: _Gray, estimate: Affine, *, stood: bool) -> bool:
     # A car that passes a camera on a plain road has most of the corners, and the estimate is its motion. The ground
-    # has the larger area: each block of the picture speaks for the estimate or for a camera that stands.
+    # has the larger area: each block of the picture speaks for the estimate or for a camera that stands. Bars, a
+    # bonnet or a skid stand before a camera that flies, but not in each half of its picture.
     moved = cv2.warpAffine(previous, estimate, current.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    part = _between_bars(current)
     by_motion, at_rest = (
-        cv2.resize(cv2.absdiff(one, current).astype(np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
+        cv2.resize(cv2.absdiff(one, current)[part].astype(np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
         for one in (moved, previous)
     )
     moves = np.count_nonzero((by_motion < _BLOCK_SHARE * at_rest) & (at_rest > _BLOCK_LEVELS))
-    stands = np.count_nonzero((at_rest < _BLOCK_SHARE * by_motion) & (by_motion > _BLOCK_LEVELS))
-    return bool(stands >= _LEAST_BLOCKS and (_STANDING_BIAS if stood else 1.0) * stands > moves)
+    stands = (at_rest < _BLOCK_SHARE * by_motion) & (by_motion > _BLOCK_LEVELS)
+    wide, high = _BLOCKS[0] // 2, _BLOCKS[1] // 2
+    halves = stands[:, :wide], stands[:, wide:], stands[: high + 1], stands[high:]
+    if min(map(np.count_nonzero, halves)) < _LEAST_BLOCKS:
+        return False
+    return bool((_STANDING_BIAS if stood else 1.0) * np.count_nonzero(stands) > moves)
+
+
+def _between_bars(image: _Gray) -> tuple[slice, slice]:
+    # The picture without the plain rows and columns at its border, and what coding blurs beside them.
+    found = []
+    for axis in (1, 0):
+        lines = np.flatnonzero(np.ptp(image, axis=axis) > _BAR_LEVELS)
+        size = image.shape[1 - axis]
+        low, high = (int(lines[0]), int(lines[-1]) + 1) if len(lines) else (0, size)
+        found.append(slice(low + _BLUR_PX // 2 * bool(low), high - _BLUR_PX // 2 * (high < size)))
+    return found[0], found[1]
 
 
 def _plausible(affine: Affine) -> bool:

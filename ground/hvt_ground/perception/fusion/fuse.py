@@ -20,10 +20,10 @@ smoothed over some detections. The edge's counts `EDGE_CLASS_WEIGHT` times, and 
 than the base. The classes of stills come after, in `refine`, and stand above both.
 
 **Expiry.** All entities end where another scene begins. An edge's track ends when two steps in a row do not list it,
-or one that comes more than `REACH_S` after the last that did; or when nothing is reported of it for `PATIENCE_S`, or
-for twice the time from one step to the next where that is longer. An entity that only a still has shown ends
-`PATIENCE_S` after the still. A box of the edge whose way since is not known, for it came once or is moving, is not
-listed after `REACH_S`: it would stand on an empty road.
+or when nothing is reported of it for `PATIENCE_S`, or for twice the time from one step to the next where that is
+longer. An entity that only a still has shown ends `PATIENCE_S` after the still. A box of the edge whose way since is
+not known, for it came once, is moving or leaves the picture, is not listed after `REACH_S`: it would stand on an
+empty road.
 
 **Missed-detection evidence.** An edge-only entity is listed from a sure confidence on. If a step shows nothing at a
 ground-only one, of a class that the edge can name, it must be the surer the larger the share of objects is that the
@@ -181,10 +181,6 @@ class Fusion:
             if row is not None:
                 self._update_edge(entity, step, row)
         self._associate(step, list(listed.values()))
-        for entity in self._entities:
-            reported = entity.reported
-            if entity.missed and reported and frame_index - reported.frame_index > self._rules.reach:
-                entity.missed = MISSED_STEPS
         if own is not None:
             self._split(own, frame_index)
         self._update(own, frame_index)

@@ -116,10 +116,6 @@ FIND = "own 0 1=A; found 0 A+3 B; own 1 1=A"
         ("own 0; step 0 70=A 71=B; step 5 71=B; step 10 71=B; own 11", "2=edge@B"),
         ("own 0; step 0 70=A 71=B; step 5 71=B; step 10 71=B; own 40", "2=edge"),
         ("own 0; step 0 70=A 71=B; step 5 71=B; step 10 71=B; own 41", ""),
-        # A slow edge that no longer lists it would have to say so twice.
-        ("own 0; step 0 70=A; step 5 70=A; step 20; own 21", "1=edge@A"),
-        ("own 0; step 0 70=A; step 5 70=A; step 21; own 22", ""),
-        ("own 0; step 0 70=A; step 5 70=A; step 21 71=A; own 22", "1=edge@A"),
         # A track that we see well would vanish with the edge's report.
         ("own 0 1=A; step 0 70=A; step 5; step 10; own 11 1=A", "1=base@A"),
         # Two cars that once overlapped would share one box between them for ever.
