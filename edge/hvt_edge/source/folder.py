@@ -17,6 +17,7 @@ import av
 import av.error
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
@@ -226,9 +227,8 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
         if not data.size:
             return None
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
-        if is_tiff(str(file)) and any(said in data.tobytes() for said in _GREY_AND_ALPHA):
-            (frame,) = av.CodecContext.create("tiff", "r").decode(av.Packet(data.tobytes()))
-            image = frame.reformat(format="gray16le").to_ndarray()
+        if image is not None and is_tiff(str(file)) and any(b in data.tobytes() for b in _GREY_AND_ALPHA):
+            image = _of_sixteen_bits(data.tobytes(), image)
         deep = stretch or Stretch(lambda _: None)
         if image is not None and image.itemsize > 1:
             if data[:4].tobytes() == _PNG and not data[_PNG_KIND] & _PNG_COLOUR:
@@ -240,11 +240,16 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
             return deep.colours(np.asarray(image, np.uint16)[..., :3])
         # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    except (
-        OSError,
-        ValueError,
-        av.error.FFmpegError,
-        cv2.error,
-    ):  # it has just gone, or its header claims too large a size
+    except (OSError, cv2.error):  # it has just gone, or its header claims too large a size
         return None
     return None if image is None else np.asarray(image, np.uint8)
+
+
+def _of_sixteen_bits(tiff: bytes, eight: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    # FFmpeg keeps them, but shows tiles (GeoTIFF) black without an error: then the eight that OpenCV keeps.
+    with suppress(ValueError, av.error.FFmpegError):
+        (frame,) = av.CodecContext.create("tiff", "r").decode(av.Packet(tiff))
+        grey = frame.reformat(format="gray16le").to_ndarray()
+        if grey.shape == eight.shape and (grey // 256 + 1 >= eight).all():
+            return grey
+    return eight.astype(np.uint16) * 257

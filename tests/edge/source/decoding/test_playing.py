@@ -3,6 +3,7 @@
 import gc
 import logging
 import shutil
+import struct
 import threading
 from fractions import Fraction
 from types import SimpleNamespace
@@ -336,6 +337,23 @@ def test_grey_with_transparency_is_stretched_in_a_folder_too(tmp_path, kind, pix
         source, pictures = play(place)
         assert pictures[0][(10, 40), 30, 0].tolist() == [0, 255]
         assert "stretched" in " ".join(source.notes)
+
+
+def test_a_tiled_tiff_of_grey_with_transparency_is_not_flat(tmp_path):
+    """FFmpeg decodes the tiles of a GeoTIFF to one grey without an error."""
+    grey = np.where(np.arange(64)[:, None] < 24, 7000, 14_000).repeat(64, axis=1)
+    pixels = np.dstack([grey, np.full_like(grey, 65_535)]).astype("<u2").tobytes()
+    tags = {256: 64, 257: 64, 258: 16 | 16 << 16, 259: 1, 262: 1, 277: 2, 284: 1, 322: 64, 323: 64}
+    counts, begin = {258: 2, 338: 1}, 8 + 2 + 12 * 12 + 4
+    entries = [(tag, 3, counts.get(tag, 1), value) for tag, value in {**tags, 338: 2}.items()]
+    entries = sorted([*entries, (324, 4, 1, begin), (325, 4, 1, len(pixels))])
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries))
+    (tmp_path / "0.tif").write_bytes(
+        head + b"".join(struct.pack("<HHII", *entry) for entry in entries) + bytes(4) + pixels
+    )
+    source, pictures = play(tmp_path)
+    assert pictures[0][(10, 40), 30, 0].tolist() == [0, 255]
+    assert "stretched" in " ".join(source.notes)
 
 
 @pytest.mark.parametrize("most", [(1000, 1023, 40_000, 900), (16_384, 900, 65_535), (0, 900, 40_000)])
