@@ -13,16 +13,20 @@ _NUMBER = r"[+-]?\d++(?:[.,]\d++)?+(?:[eE][+-]?\d++)?+(?!\s?[°º]\s?\d)"
 _TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
 _SIDE = r"(?i:([EWNS]|east|west|north|south))"
-_BEHIND = rf"\s?(?:°|deg)?\s?{_SIDE}\b(?!\s*:)"
-_MORE = r"[ \t°º]{0,3}(?:deg(?:rees?)?\b[ \t]?)?([^\W\d_]\w*+(?!\s{0,4}[:(]))"
-"""A word, but for the name of the next value."""
+_DEG = r"deg(?:rees?+)?+"
+_WORD = r"[^\W\d_]++(?!\w|[ \t]{0,4}(?:[:(=/]|[+-]?\d))"
+"""But for the name of the next value, with a sign between or none."""
+_BEHIND = rf"\s?(?:°|{_DEG})?\s?{_SIDE}\b(?!\s*:)"
+_MORE = rf"[ \t°º]{{0,3}}+(?:{_DEG}\b[ \t]?)?+({_WORD})"
+"""A word that may be a side in another language."""
 _LATLON = r"(?i:l(?:at|ongt?)itude)\s{0,4}[:(]"
 _NAMED = re.compile(
     rf"\b(?!{_LATLON}\s*[+-]?\d++(?:[ :]\d|[.,]\d++\.\d))"
-    rf"([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}(?:{_BEHIND})?(?:{_MORE})?"
+    rf"([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}"
+    rf"(?:{_BEHIND}(?!(?<=[A-Za-z]{{2}})[ \t]+{_WORD})|{_MORE})?"
 )
 """But for latitudes and longitudes of 47 06.1, 47:06:01 or 47.06.01, whose degrees alone are another place."""
-_DEGREES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER})(?:{_BEHIND}|(?:\s?deg\b)?(?!\s+[\d+-]))")
+_DEGREES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER})(?:{_BEHIND}|(?:\s?{_DEG}\b)?(?!\s+[\d+-]))")
 """Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter or word behind the number, of one of both at least; or none."""
 _SAYS_PLACE = re.compile(rf"\b(?:GPS\s*\(|{_LATLON})[^\],;)\n]{{0,40}}?\d")
 """A number where the first of a place stands, whether it is read or not."""

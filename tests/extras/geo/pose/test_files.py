@@ -226,6 +226,8 @@ UNREAD = "1 of its 1 blocks have a place that is not understood"
         ("a.srt", "00:00:00,000 -->\nGPS(33.25 Süd, 70.5 Ouest, 50)\n", UNREAD),
         ("a.srt", "00:00:00,000 -->\n[latitude: 33.25 Süd] [longitude: 70.5]\n", UNREAD),
         ("a.srt", "00:00:00,000 -->\nlatitude: 33.25°\nlongitude: 70.5 West wind\n", UNREAD),
+        ("a.srt", "00:00:00,000 -->\nlatitude: 33.25 deg Süd longitude: 70.5\n\n2\n", UNREAD),
+        ("a.srt", "00:00:00,000 -->\nlatitude: 33.25\nlongitude: 70.5° Ouest\n\n2\n", UNREAD),
         ("a.srt", MINI.replace("00:00:01,000 -->", "9999:00:01,000 -->"), "time_s is 3.59964e"),
         ("a.srt", MINI.replace("pitch: -45.0", "pitch: -95.0"), "camera_pitch_deg is -95, accepted is -92"),
     ],
@@ -300,6 +302,19 @@ def test_a_fixed_camera_is_where_it_was_put():
         ("latitude: 47.1 longitude: 8.5 S: 12", (47.1, 8.5, None), ""),
         ("[latitude: 47.1 W] [longitude: 8.5 W: 12] [longitude: 8.5 S]", (47.1, 8.5, None), ""),
         ("[latitude: 48,1000] [longitude: 11,5000] [rel_alt: 50,5 abs_alt: 570,2]", (48.1, 11.5, 50.5), ""),
+        *(
+            (f"latitude: 47.1{more} longitude: 8.5{more.replace('N', 'E')}{last}", (47.1, 8.5, None), "")
+            for more, last in (
+                ("", " rel_alt = 30"),
+                (" deg", " iso=100"),
+                ("deg", " F/2.8"),
+                (" degrees", ""),
+                (" degrees N", " alt 30 m"),
+                (" N", " altitude 120 m"),
+            )
+        ),
+        ("latitude: 47.1 longitude: 8.5 H 30m", (47.1, 8.5, 30), ""),
+        ("latitude: 47.1 North longitude: 8.5 East\n\n2", (47.1, 8.5, None), ""),
         (
             "[latitude : -34.5] [longtitude : -58.5] [altitude: 74.7]",
             (-34.5, -58.5, None),
