@@ -33,7 +33,9 @@ _MOSTLY = 0.5
 _USUAL = (".jpg", ".jpeg", ".webp", ".bmp", ".png", ".tif", ".tiff")
 _ENDINGS = (*_USUAL, ".jpe", ".jfif", ".jp2", ".pgm", ".ppm", ".pnm")
 """Beside usual ones the others are masks or depths of the same pictures; so is 1.png beside 1.jpg, or 1.tif."""
-_MOST_SERIES = 9
+_MOST_SERIES = 10
+_LEAST_BANDS, _NEARLY = 4, 0.9
+"""Bands of a camera, and the share of its pictures that have each."""
 _GREY_AND_ALPHA = (b"\2\1\3\0\2\0\0\0\x10\0\x10\0", b"\1\2\0\3\0\0\0\2\0\x10\0\x10")
 """TIFF's BitsPerSample (258) of 16 and 16, in both orders of bytes: OpenCV keeps eight."""
 _PNG, _PNG_KIND, _PNG_COLOUR = b"\x89PNG", 25, 2
@@ -106,20 +108,23 @@ def _gaps(files: list[Path]) -> str:
     return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
-def _bands(files: list[Path]) -> Counter[str]:
-    # Cameras of several bands number these behind a picture's number: IMG_0001_1 to IMG_0001_5. Of other names none.
-    parts = [re.fullmatch(r"(.*[0-9])_([0-9])", file.stem) for file in files]
-    pairs = [(one[1], one[2]) for one in parts if one]
+def _bands(stems: list[str]) -> Counter[str]:
+    # Cameras of several bands number them from 1 behind a picture's number: IMG_0001_1 to IMG_0001_5. Of other names
+    # none: fewer are a burst, and those from 0 tenths of a second.
+    parts = [re.fullmatch(r"(.*[0-9])_(0|[1-9][0-9]?)", stem) for stem in stems]
+    pairs = [(one[1], int(one[2])) for one in parts if one]
     counts = Counter(band for _, band in pairs)
-    each = len({picture for picture, _ in pairs})
-    whole = len(pairs) == len(files) and set(counts.values()) == {each} and each > len(counts)
-    return Counter({f"{re.sub(r'[0-9]+', '#', pairs[0][0])}_{band}": each for band in counts if whole})
+    each, most = len({picture for picture, _ in pairs}), len(counts)
+    in_a_row = set(counts) == set(range(1, most + 1)) and _LEAST_BANDS <= most < each
+    if not in_a_row or len(pairs) < _NEARLY * max(len(stems), each * most):
+        return Counter()
+    return Counter({f"{re.sub(r'[0-9]+', '#', pairs[0][0])}_{band}": counts[band] for band in counts})
 
 
 def _series(files: list[Path]) -> str:
     counts = Counter(re.sub(r"[0-9]+", "#", file.stem) for file in files)
-    if len(counts) == 1 and (bands := _bands(files)):
-        counts = bands
+    if sum(count > 1 for count in counts.values()) == 1:
+        counts = _bands([file.stem for file in files]) or counts
     series = sorted((name, count) for name, count in counts.items() if count > 1)
     if not 1 < len(series) <= _MOST_SERIES:
         return ""

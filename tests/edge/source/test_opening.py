@@ -222,11 +222,24 @@ def test_each_of_a_drones_series_is_said_by_its_whole_name(tmp_path):
     assert all(f"2 '#_{band}'" in said for band in bands)
 
 
-@pytest.mark.parametrize(("pictures", "bands", "said"), [(6, 5, "6 'IMG_#_1', 6 'IMG_#_2'"), (2, 9, "")])
+@pytest.mark.parametrize(
+    ("pictures", "bands", "said"),
+    [
+        (6, range(1, 6), "6 'IMG_#_1', 6 'IMG_#_2', 6 'IMG_#_3', 6 'IMG_#_4', 5 'IMG_#_5'"),
+        (11, range(1, 11), "11 'IMG_#_1', 10 'IMG_#_10', 11 'IMG_#_2'"),
+        (2, range(1, 10), ""),  # two clips of nine pictures
+        (5, range(1, 4), ""),  # bursts
+        (5, (0, 5), ""),  # tenths of a second
+        (6, (0, 2, 4, 6, 8), ""),
+        (11, range(10), ""),
+    ],
+)
 def test_bands_that_are_numbered_are_said(tmp_path, pictures, bands, said):
-    """A camera's five bands in turn were one film without a word; two clips of nine pictures are none."""
+    """A camera's five bands in turn were one film without a word, also with a lost one and another file."""
     for number in range(pictures):
-        write_pictures(tmp_path, f"IMG_{number:04}_{{}}.png", range(1, bands + 1))
+        write_pictures(tmp_path, f"IMG_{number:04}_{{}}.png", bands)
+    write_pictures(tmp_path, "cover.png", (9,))
+    (tmp_path / f"IMG_{pictures - 1:04}_{bands[-1]}.png").unlink()
     notes = " ".join(play(tmp_path)[0].notes)
     assert said in notes
     assert ("several series" in notes) == bool(said)
