@@ -10,6 +10,7 @@ import csv
 import logging
 import math
 import re
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -316,12 +317,14 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     points, tracks = _points(text, path)
     number_of = {point: number for number, track in enumerate(tracks) for point in track.iterfind("{*}trkpt")}
     placed: dict[int, set[tuple[float, ...]]] = {}
+    rows: list[tuple[int, _Values | UserError]] = []
     for number, point in enumerate(points, 1):
         where = f"pose file {path}, point {number}"
         time = point.findtext("{*}time")
         if time is None:
             untimed += 1
             continue
+        segment = number_of.get(point, len(tracks))
         try:
             row = {
                 "utc_s": _utc_s(time, where),
@@ -332,20 +335,29 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
             if elevation.lower() not in _UNSAID:
                 row["altitude_m"] = _number(elevation, f"{where}: ele")
         except UserError as error:
-            yield error
+            rows.append((segment, error))
             continue
-        placed.setdefault(number_of.get(point, len(tracks)), set()).add(
-            (row["utc_s"], row["latitude_deg"], row["longitude_deg"])
-        )
-        yield row
-    # Not a single point, nor the copy of a part of another; the middle half: before a fix receivers say any time.
-    several = {frozenset(one) for one in placed.values() if len(one) > 1}
-    ordered = [sorted(one) for one in several if not any(one < other for other in several)]
+        placed.setdefault(segment, set()).add((row["utc_s"], row["latitude_deg"], row["longitude_deg"]))
+        rows.append((segment, row))
+    # Not the copy of a part of another, nor a short one; the middle half: before a fix receivers say any time.
+    least = max(2, max(map(len, placed.values()), default=0) / 10)
+    long = {frozenset(one) for one in placed.values() if len(one) >= least}
+    ordered = [sorted(one) for one in long if not any(one < other for other in long)]
     spans = sorted((one[len(one) // 4][0], one[-1 - len(one) // 4][0]) for one in ordered)
     if any(first[1] > second[0] for first, second in pairwise(spans)):
         raise UserError(
             f"pose file {path} has {len(spans)} tracks or segments of the same time: keep the camera's alone"
         )
+    strays = {
+        number
+        for number, one in placed.items()
+        if len(one) < least
+        and (before := bisect_left(spans, (min(one)[0],)))
+        and max(one)[0] < spans[before - 1][1]
+    }
+    stray = UserError(f"pose file {path} has short segments within the time of longer ones: {len(strays)}")
+    for segment, read in rows:
+        yield stray if segment in strays else read
     if untimed:
         _log.warning("pose file %s: %d points have no time, and are left out", path, untimed)
 

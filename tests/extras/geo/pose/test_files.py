@@ -462,6 +462,18 @@ def test_subtitles_of_the_web_count_minutes(tmp_path):
     assert table.at(3 * SECOND_NS, capture_ns=0).latitude_deg == 47.5
 
 
+def test_a_short_segment_within_the_time_of_a_long_one_is_left_out(tmp_path, caplog):
+    """Three points of another receiver refused the whole flight."""
+    points = [track(range(31)), track(range(31, 60)), track([40, 41, 42]).replace('lat="47', 'lat="48')]
+    text = points[0].replace(
+        "</gpx>", "".join(one.partition(">")[2].replace("</gpx>", "") for one in points[1:])
+    )
+    table, _ = read(tmp_path, "a.gpx", f"{text}</gpx>")
+    seen = [table.at(n * SECOND_NS, capture_ns=0) for n in range(60)]
+    assert max(one.latitude_deg for one in seen) < 48
+    assert "3 of 63 rows are left out: " in caplog.text
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
