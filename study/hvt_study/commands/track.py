@@ -19,7 +19,7 @@ from hvt_study.datasets.labels import check_pixels
 _log = logging.getLogger(__name__)
 
 _MOT = "frame,id,x,y,w,h,score"
-_FEW = 8
+_FEW = 10
 """Boxes of which some lie right of the picture's middle."""
 _REMEMBERED = 3
 """Frames without detections after which the tracker, where it tracks nothing, is as after any more of them."""
@@ -35,7 +35,9 @@ def read_detections(path: Path) -> Rows:
     score, ids = rows["score"], rows["id"]
     rows.only((score >= 0) & (score <= 1), accepted="a score from 0 to 1 in column 7")
     check_pixels(path, [rows[side] for side in "xywh"])
-    if len(rows) >= _FEW and ((rows["w"] > rows["x"]) & (rows["h"] > rows["y"])).all():
+    sides, lengths = rows.table[:, 4:6], rows.table[:, 4:6] - rows.table[:, 2:4]
+    # Of sizes w - x is no more alike than w: those of one close object are larger than its place too.
+    if len(rows) >= _FEW and (lengths > 0).all() and lengths.var(axis=0).sum() < sides.var(axis=0).sum():
         _log.warning(
             "%s: each w is larger than its x, and each h than its y: are they corners, x1,y1,x2,y2? Accepted is %s",
             *(path, _MOT),

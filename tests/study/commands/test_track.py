@@ -53,14 +53,18 @@ def test_upstream_is_reproduced_from_file_to_file(data, tmp_path, capsys):
     np.testing.assert_allclose(ours[:, 2:7], theirs[:, 2:7], atol=1e-3)
 
 
-@pytest.mark.parametrize("corners", [False, True])
-def test_corners_in_place_of_sizes_are_told_of(tmp_path, caplog, corners):
-    """Boxes that reach over the whole picture were tracked without a word."""
-    lines = [
-        f"{frame},-1,{x},{y},{x + 20 if corners else 20},{y + 30 if corners else 30},0.9\n"
-        for frame in range(1, 5)
-        for x, y in ((10, 300), (200, 15))
-    ]
+@pytest.mark.parametrize(
+    ("boxes", "corners"),
+    [
+        (((10, 300, 20, 30), (200, 15, 20, 30)), False),
+        (((10, 300, 30, 330), (200, 15, 220, 45)), True),
+        (((100, 60, 300, 240),), False),
+        (((100, 60, 300, 240), (90, 70, 305, 238)), False),
+    ],
+)
+def test_corners_in_place_of_sizes_are_told_of(tmp_path, caplog, boxes, corners):
+    """Boxes that reach over the whole picture were tracked without a word; one close object is none of these."""
+    lines = [f"{frame},-1,{','.join(map(str, box))},0.9\n" for frame in range(1, 11) for box in boxes]
     read_detections(write(tmp_path / "det.txt", lines))
     assert ("are they corners, x1,y1,x2,y2? Accepted is frame,id,x,y,w,h,score" in caplog.text) == corners
 
