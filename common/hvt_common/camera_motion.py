@@ -239,7 +239,7 @@ def _stands(previous: _Gray, current: _Gray, estimate: Affine, *, stood: bool) -
 
 
 def _between_bars(image: _Gray) -> tuple[slice, slice]:
-    # The picture without the plain rows and columns at its border, and what coding blurs beside them.
+    # The picture without the plain rows and columns at its border, and those beside them that coding blurs.
     found = []
     for axis in (1, 0):
         lines = np.flatnonzero(np.ptp(image, axis=axis) > _BAR_LEVELS)
