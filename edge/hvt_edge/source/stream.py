@@ -166,7 +166,7 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
         try:
-            decoded = decoder.decode(packet)
+            decoded = decoder.decode(packet, now_s=time.monotonic())
         except av.error.FFmpegError:
             decoded = []
             damaged = None if damaged is None else damaged + is_picture_each(stream)

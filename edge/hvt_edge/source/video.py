@@ -40,7 +40,7 @@ class VideoSource(ClipSource):
         with container:
             self._stamps, first = survey(container, stream, name=self._name)
             if self._override is not None:
-                self._stamps = Stamps(1 / self._override, usable=False)
+                self._stamps = Stamps(1 / self._override, usable=False, whole=self._stamps.whole)
             lasts_s = self._duration_s(stream)
             self._pictures.begin(stream)
             _, shown = next(self._shown([(Fraction(0), first)]))

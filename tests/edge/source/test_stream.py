@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from unittest import mock
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -18,9 +19,11 @@ from hvt_codecs.passthrough.camera import Passthrough
 from hvt_codecs.passthrough.sources import CodedStreamGrabber
 from hvt_common.errors import NotYetError, UserError
 from hvt_edge.source import stream
+from hvt_edge.source.decoding.container import choose_stream
 from hvt_edge.source.live import SignalLost
 from hvt_edge.source.opening import open_source
-from hvt_edge.source.stream import StreamGrabber, _in_time
+from hvt_edge.source.stream import StreamGrabber, _decoded, _in_time
+from media.numbered import numbered
 
 
 def film_that_stops(*, pictures: int = 10, tones: int = 200, **options: str) -> io.BytesIO:
@@ -136,6 +139,27 @@ def test_a_camera_that_is_decoded_too_slowly_stays_live(monkeypatch, decoding_s,
         now_s[0] += decoding_s
     assert kept[0] <= count / (120 * rate) <= kept[1] + 0.02
     assert max(late_s[400:]) < 1.6 or keyframes > 50, "once the camera's second keyframe has come"
+
+
+@pytest.mark.parametrize("whole", [0, 1])
+def test_jpegs_that_come_slowly_are_shown_where_none_is_whole(monkeypatch, whole):
+    """One each 3 s was dark after the first, and the camera opened again for ever."""
+    jpeg = cv2.imencode(".jpg", numbered(0))[1].tobytes()
+    broken = jpeg[: len(jpeg) // 2] + jpeg[len(jpeg) // 2 + 188 :]
+    now_s, said = [0.0], []
+
+    def packets(opened, _):
+        for packet in filter(lambda one: one.size, opened.demux()):
+            yield packet
+            now_s[0] += 3
+
+    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(stream, "live_packets_of", packets)
+    pictures = SimpleNamespace(say=said.append, frames=lambda frame: [frame], bgr=id)
+    with av.open(io.BytesIO(jpeg * whole + broken * 6), format="mjpeg") as opened:
+        shots = list(_decoded(opened, choose_stream(opened), pictures))
+    assert len(shots) == whole + 5, "the first that is damaged may be one alone"
+    assert set(said) == {"damaged pictures come, shown as the decoder has patched them"}
 
 
 def test_a_camera_of_which_another_program_alone_goes_on_has_stopped(quarters):

@@ -64,8 +64,8 @@ _FILE_OPTIONS = {
 _PLAYLIST, _IN_SEGMENTS = ".m3u8", "hls"
 _WITHOUT_INDEX, _MOST_BEHIND = frozenset({"mpegts", "flv"}), 0.2
 """Formats that end with their last picture; a larger part behind it is another recording, or sound alone."""
-_MOST_DAMAGED = 8
-"""JPEGs in a row: of a longer row each is shown."""
+_MOST_DAMAGED, _MOST_DAMAGED_S = 8, 2.0
+"""JPEGs in a row, and seconds from the first of them: of a longer row each is shown."""
 _TS_BYTES = (188, 192, 204)
 """Size of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
 
@@ -233,10 +233,13 @@ def survey(container: Any, stream: Any, *, name: str) -> tuple[Stamps, av.VideoF
     """The times in the stream's first packets, and its first frame. Raises `UserError` where none decodes there."""
     times: list[tuple[Fraction | None, Fraction | None]] = []
     first: av.VideoFrame | None = None
+    patched: av.VideoFrame | None = None
     why, decoder = "", Decoder(stream)
     for packet in packets_of(container, stream):
         if first is None:
             with suppress(av.error.FFmpegError):
+                if is_picture_each(stream) and patched is None:
+                    patched = next(iter(Decoder(stream, whole=False).decode(packet)), None)
                 first = next(iter(decoder.decode(packet)), None)
         if isinstance(packet, Exception):
             why = f" ({cause_of(packet)})"
@@ -249,16 +252,20 @@ def survey(container: Any, stream: Any, *, name: str) -> tuple[Stamps, av.VideoF
             times.append((_seconds(packet.pts, base), _seconds(packet.dts, base)))
         if len(times) >= _SURVEYED and first is not None:
             break
+    whole = first is not None and not decoder.patched
+    first = first if whole else patched or first
     if first is None:
         raise UserError(f"source {name!r} holds a video stream of which no frame can be decoded{why}")
     rate = said_rate(stream)
     if without_stamps(stream):
-        return Stamps(1 / (rate or Fraction(25)), usable=False), first
+        return Stamps(1 / (rate or Fraction(25)), usable=False, whole=whole), first
     reorders = bool(stream.codec_context.has_b_frames)
     stamps = surveyed(times, said_fps=rate, reorders=reorders)
     long_s = LONG_STEP_S if container.format.flags & _MAY_JUMP else LONG_PAUSE_S
     # AVI's presentation stamps are FFmpeg's guess, wrong where frames were dropped, or two lie in a packet.
-    return replace(stamps, ordered=stamps.ordered and container.format.name != "avi", long_s=long_s), first
+    return replace(
+        stamps, ordered=stamps.ordered and container.format.name != "avi", long_s=long_s, whole=whole
+    ), first
 
 
 def decoded(
@@ -269,7 +276,7 @@ def decoded(
     Damage is skipped and reported once, at the end; a jump of the time stamps is mended and reported when it comes.
     """
     timeline = stamps.timeline(stream)
-    reading = _Reading(container, stream)
+    reading = _Reading(container, stream, whole=stamps.whole)
     before_s: Fraction | None = None
     lost, each_is_one = 0, is_picture_each(stream)
     segments = container.format.name == _IN_SEGMENTS
@@ -301,8 +308,8 @@ def decoded(
 
 
 class _Reading:
-    def __init__(self, container: Any, stream: Any) -> None:
-        self._container, self._stream, self._decoder = container, stream, Decoder(stream)
+    def __init__(self, container: Any, stream: Any, *, whole: bool) -> None:
+        self._container, self._stream, self._decoder = container, stream, Decoder(stream, whole=whole)
         self._size = _size_of(container)
         self._begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)  # guessed later
         self.damaged = self._count = self._lossy = 0
@@ -434,26 +441,32 @@ def is_picture_each(stream: Any) -> bool:
 class Decoder:
     """Decodes the packets of one stream; ``patched`` counts the damaged pictures that it gave out.
 
-    A damaged JPEG is none of these while others are whole: each is a picture of its own, and the one before is seen
-    instead. Where none is whole, as of a camera that breaks the standard in each, they are shown.
+    A JPEG whose damage the decoder notices is none of these while others are whole: each is a picture of its own, and
+    the one before is seen instead. Where none is whole, as of a camera that breaks the standard in each, they are
+    shown: ``whole`` says that the first ones are not known to be such.
     """
 
-    def __init__(self, stream: Any) -> None:
+    def __init__(self, stream: Any, *, whole: bool = True) -> None:
         self._stream = stream
-        self._damaged_in_a_row = self.patched = 0
+        self._damaged_in_a_row = 0 if whole else _MOST_DAMAGED
+        self._damaged_at_s = 0.0
+        self.patched = 0
 
-    def decode(self, packet: Any) -> list[av.VideoFrame]:
+    def decode(self, packet: Any, *, now_s: float = 0.0) -> list[av.VideoFrame]:
         """The pictures of a packet, of the stream's own codec; after an error those that were held back.
 
-        Raises `FFmpegError` for a damaged packet.
+        ``now_s`` is the time at which a live one came, in seconds. Raises `FFmpegError` for a damaged packet.
         """
         if isinstance(packet, Exception):
             return list(self._stream.codec_context.decode(None))
         try:
             frames: list[av.VideoFrame] = list(packet.decode())
         except av.error.FFmpegError:
+            if not self._damaged_in_a_row:
+                self._damaged_at_s = now_s
             self._damaged_in_a_row += 1
-            if not is_picture_each(self._stream) or self._damaged_in_a_row <= _MOST_DAMAGED:
+            few = self._damaged_in_a_row <= _MOST_DAMAGED and now_s - self._damaged_at_s <= _MOST_DAMAGED_S
+            if few or not is_picture_each(self._stream):
                 raise
             # One that has decoded no other: FFmpeg would go on with an older picture where this one is cut.
             frames = av.CodecContext.create("mjpeg", "r").decode(packet)

@@ -34,6 +34,8 @@ class Stamps:
     """Whether they are presentation times; else decoding times, as in AVI: the n-th frame shown has the n-th."""
     long_s: Fraction = LONG_STEP_S
     """A longer step is a jump."""
+    whole: bool = True
+    """Whether the first picture that is shown is not damaged."""
 
     def timeline(self, stream: Any) -> Timeline:
         quantum_s = stream.time_base if self.usable else None

@@ -484,15 +484,16 @@ def test_a_picture_that_is_damaged_is_held_over(tmp_path, caplog, damage):
         assert says in caplog.text
 
 
+@pytest.mark.parametrize("count", [5, 20])
 @pytest.mark.parametrize("name", ["a.mjpeg", "a.avi"])
-def test_where_no_picture_is_whole_they_are_shown_and_said_to_be_damaged(tmp_path, caplog, name):
-    """A camera whose every picture breaks the standard would be dark."""
+def test_where_no_picture_is_whole_they_are_shown_and_said_to_be_damaged(tmp_path, caplog, name, count):
+    """A camera whose every picture breaks the standard would be dark, and a film of a few refused."""
     raw = tmp_path / "a.mjpeg"
-    raw.write_bytes(b"".join(jpegs(20, damaged=lambda _, data: lose_bytes(data))))
+    raw.write_bytes(b"".join(jpegs(count, damaged=lambda _, data: lose_bytes(data))))
     clip = raw if raw.name == name else copied([(raw, lambda _: 0)], tmp_path / name)
     _, pictures = play(clip, fps=25)
-    assert len(pictures) >= 12
-    assert "has 12 damaged pictures, shown as the decoder has patched them" in caplog.text
+    assert len(pictures) == count
+    assert f"has {count} damaged pictures, shown as the decoder has patched them" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["2026-01-26T20:57:04Z.mp4", "rtsp: a & b.mp4", "100%.mp4", "clip@2x.mp4"])
