@@ -361,9 +361,24 @@ class Outputs:
         self._sinks: list[QueuedSink[Any]] = []
         self._lock = threading.Lock()
 
-    def open(self, part: str, open_sink: Callable[[], SinkWriter[T]], **how: Any) -> QueuedSink[T]:
-        """A sink behind a queue; ``how`` as for `QueuedSink`."""
-        sink = QueuedSink(part, open_sink, failures=self._failures, **how)
+    def open(
+        self,
+        part: str,
+        open_sink: Callable[[], SinkWriter[T]],
+        *,
+        wait_s: float = 0.0,
+        for_backlog: bool = False,
+        longest_pause_s: float = 60.0,
+    ) -> QueuedSink[T]:
+        """A sink behind a queue (`QueuedSink`)."""
+        sink = QueuedSink(
+            part,
+            open_sink,
+            failures=self._failures,
+            wait_s=wait_s,
+            for_backlog=for_backlog,
+            longest_pause_s=longest_pause_s,
+        )
         with self._lock:
             self._sinks = [one for one in self._sinks if not one.ended]
             self._sinks.append(sink)
