@@ -13,7 +13,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, fitted_text
+from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
 from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
@@ -103,14 +103,23 @@ class Commands:
                 self._answered[request.request_id] = answer
             return answer
 
-    def _answer(self, *, reason: str = "", note: str = "", **found: Any) -> ControlAnswer:
-        fields: dict[str, Any] = {"still_request": -1, "frame_index": -1, "tracks": ()} | found
+    def _answer(
+        self,
+        *,
+        reason: str = "",
+        still_request: int = -1,
+        frame_index: int = -1,
+        tracks: tuple[TrackNow, ...] = (),
+        note: str = "",
+    ) -> ControlAnswer:
         return ControlAnswer(
             session_id=self.session_id,
             accepted=not reason,
             reason=fitted_text(reason, _REASON_BYTES),
+            still_request=still_request,
+            frame_index=frame_index,
+            tracks=tracks,
             note=fitted_text(note, _REASON_BYTES),
-            **fields,
         )
 
     def _obey(self, request: ControlRequest) -> ControlAnswer:
