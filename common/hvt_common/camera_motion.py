@@ -91,7 +91,9 @@ _BLOCK_LEVELS: Final = 2.0
 _BLOCK_SHARE: Final = 0.85
 """A block speaks for the motion that leaves this share of the other's difference, and that is at least the levels."""
 _LEAST_BLOCKS: Final = 3
+"""So many stand in each half of the picture of a camera that stands."""
 _BAR_LEVELS: Final = 12
+"""A row or column within these is a bar at the border, not a part of the picture."""
 _STANDING_BIAS: Final = 2.0
 """A camera that stood needs so many blocks for each that says it still does: it passes for one in traffic."""
 # No camera zooms or rolls this far between two frames: such an estimate is wrong.

@@ -232,7 +232,7 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
         if not data.size:
             return None
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
-        if image is not None and is_tiff(str(file)) and any(b in data.tobytes() for b in _GREY_AND_ALPHA):
+        if image is not None and image.ndim == 2 and image.dtype == np.uint8 and is_tiff(str(file)):
             image = _of_sixteen_bits(data.tobytes(), image)
         deep = stretch or Stretch(lambda _: None)
         if image is not None and image.itemsize > 1:
@@ -252,6 +252,8 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
 
 def _of_sixteen_bits(tiff: bytes, eight: npt.NDArray[Any]) -> npt.NDArray[Any]:
     # FFmpeg keeps them, but shows tiles (GeoTIFF) black without an error: then the eight that OpenCV keeps.
+    if not any(one in tiff for one in _GREY_AND_ALPHA):
+        return eight
     with suppress(ValueError, av.error.FFmpegError):
         (frame,) = av.CodecContext.create("tiff", "r").decode(av.Packet(tiff))
         grey = frame.reformat(format="gray16le").to_ndarray()

@@ -312,7 +312,7 @@ def _join(sinks: Sequence[QueuedSink[Any]], within_s: float) -> None:
         return
     for one in sinks:
         one._hurry.set()  # noqa: SLF001
-    joined(*threads, left=int, within_s=1.0)
+    joined(*threads, left=lambda: 0, within_s=1.0)
     for one in sinks:
         if not one.ended:
             one._fail(UserError("it did not end in time, and what it had yet to write is lost"))  # noqa: SLF001

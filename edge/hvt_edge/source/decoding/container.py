@@ -238,9 +238,10 @@ def survey(container: Any, stream: Any, *, name: str) -> tuple[Stamps, av.VideoF
     for packet in packets_of(container, stream):
         if first is None:
             with suppress(av.error.FFmpegError):
-                if is_picture_each(stream) and patched is None:
-                    patched = next(iter(Decoder(stream, whole=False).decode(packet)), None)
                 first = next(iter(decoder.decode(packet)), None)
+        if first is None and patched is None and is_picture_each(stream):
+            with suppress(av.error.FFmpegError):
+                patched = next(iter(Decoder(stream, whole=False).decode(packet)), None)
         if isinstance(packet, Exception):
             why = f" ({cause_of(packet)})"
             if "://" in name and "mp4" in container.format.name:

@@ -315,7 +315,9 @@ def test_pictures_of_heat_in_a_folder_are_stretched_too(tmp_path, unseen):
         levels[:9] = unseen
         cv2.imwrite(str(tmp_path / "0.tiff"), levels)
     else:
-        Image.fromarray(heat().astype(unseen)).save(tmp_path / "0.tiff")
+        levels = heat().astype(unseen)
+        levels[0, :6] = 0x102, 3, 2, 0, 16, 16  # in 16 bits, the bytes of the tag of grey with transparency
+        Image.fromarray(levels).save(tmp_path / "0.tiff")
     for place in (tmp_path, tmp_path / "0.tiff"):
         source, pictures = play(place)
         assert pictures[0][60, 70, 0] - np.median(pictures[0]) > 150
