@@ -5,16 +5,14 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import exit_with_sentence, not_installed
+from hvt_common.errors import exit_with_sentence
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import START_LOGGER, start_log
-from hvt_common.runtime.plug_ins import loaded, the_one
+from hvt_common.runtime.plug_ins import extra_command
 from hvt_common.runtime.process import (
-    ended_in_time,
     leave,
     limit_malloc_arenas,
     put_video_first,
@@ -23,8 +21,6 @@ from hvt_common.runtime.process import (
 )
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 
-_EXTRA_COMMANDS = "hvt.edge_commands"
-"""Entry points of commands that extras bring: each takes its words and returns the exit code."""
 _BROUGHT = ("doctor", "status")
 """Commands of the extras that come with HVT."""
 _DESCRIPTION = (
@@ -46,13 +42,9 @@ def program() -> NoReturn:
 
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
-    if words and not words[0].startswith("-"):
-        entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
-        if entry is not None:
-            limit_malloc_arenas()
-            return int(loaded(entry, lambda run: run, what="command")(words[1:]))
-        if words[0] in _BROUGHT:
-            raise not_installed(f"hvt-edge {words[0]}", "hvt[edge]")
+    if command := extra_command("edge", words, known=_BROUGHT):
+        limit_malloc_arenas()
+        return command()
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
     redaction = Redaction([*words, *given.values.values()])
@@ -60,7 +52,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(redaction.text(to_toml(config)), end="")
         return 0
     config = check(config)
-    from hvt_common.runtime.reporting import print_table, reported, version_of, write_json  # noqa: PLC0415
+    from hvt_common.runtime.reporting import flown, print_table  # noqa: PLC0415
     from hvt_edge.app import Edge  # noqa: PLC0415
     from hvt_edge.report.status import in_vain, table, title  # noqa: PLC0415
     from hvt_edge.world import World  # noqa: PLC0415
@@ -79,22 +71,14 @@ def _run(argv: Sequence[str] | None) -> int:
     )
     if note := note_on_share(config, given=given.values):
         logging.getLogger(START_LOGGER).info("%s", note)
-    stop, before = stop_on_signals(), version_of(config.summary)
+    stop = stop_on_signals()
 
-    def report(summary: dict[str, Any]) -> None:
-        content = redaction.value(summary)
-        if log.as_json:
-            log.result(content)
-        else:
-            print_table(title(content), table(content))
-        if config.summary is not None:
-            write_json(config.summary, content, before=before)
+    def show(content: dict[str, Any]) -> None:
+        print_table(title(content), table(content))
 
     with log.ending():
         edge = Edge(config, stop=stop, on_started=log.release, world=world)
-        content = reported(
-            partial(ended_in_time, edge.run, stop, in_hand=edge.in_hand, otherwise=edge.given_up), report
-        )
+        content = flown(edge, stop, log=log, path=config.summary, show=show)
     return 1 if in_vain(content) else 0
 
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import exit_with_sentence, needs_extra, not_installed
+from hvt_common.errors import exit_with_sentence, needs_extra
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
-from hvt_common.runtime.plug_ins import loaded, the_one
+from hvt_common.runtime.plug_ins import extra_command
 from hvt_common.runtime.process import (
-    ended_in_time,
     interrupt_on_signals,
     leave,
     limit_malloc_arenas,
@@ -34,8 +32,6 @@ Other commands, each with --help:
   hvt-ground set-budget | set-method     command it
   hvt-ground edges                       which edges are there
   hvt-ground keys                        make keys, and say who may do what"""
-_EXTRA_COMMANDS = "hvt.ground_commands"
-"""Entry points of commands that extras bring: each takes the words that follow, and returns the exit code."""
 _BROUGHT = (
     *("doctor", "edges", "export", "keyframe", "keys", "recordings", "replay"),
     *("set-budget", "set-method", "status", "still", "tracks"),
@@ -56,13 +52,8 @@ def program() -> NoReturn:
 
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
-    if words and not words[0].startswith("-"):
-        entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
-        if entry is not None:
-            install = "'hvt[ground]'" if words[0] in _BROUGHT else None
-            return int(loaded(entry, lambda run: run, what="command", install=install)(words[1:]))
-        if words[0] in _BROUGHT:
-            raise not_installed(f"hvt-ground {words[0]}", "hvt[ground]")
+    if command := extra_command("ground", words, known=_BROUGHT):
+        return command()
     from hvt_ground.extras import checked, config_class  # noqa: PLC0415
 
     config, requested = load(config_class(), argv, program="hvt-ground", description=_DESCRIPTION)
@@ -72,30 +63,17 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = checked(config)
     with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
-        from hvt_common.runtime.reporting import reported, version_of, write_json  # noqa: PLC0415
+        from hvt_common.runtime.reporting import flown  # noqa: PLC0415
         from hvt_ground.app import Ground  # noqa: PLC0415
         from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
     limit_malloc_arenas()
     put_video_first()
     leave_out_pandas()
     log = start_log("hvt-ground", quiet=config.quiet, form=config.log_format, redaction=redaction)
-    stop, before = stop_on_signals(), version_of(config.summary)
-
-    def report(summaries: list[dict[str, Any]]) -> None:
-        sessions = redaction.value(summaries)
-        if log.as_json:
-            log.result(sessions)
-        else:
-            _print(sessions)
-        if config.summary is not None:
-            write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions, before=before)
-
+    stop = stop_on_signals()
     with log.ending():
         ground = Ground(config, stop=stop, on_started=log.release)
-        reported(
-            partial(ended_in_time, ground.run, stop, in_hand=ground.in_hand, otherwise=ground.given_up),
-            report,
-        )
+        flown(ground, stop, log=log, path=config.summary, show=_print)
     return 0
 
 

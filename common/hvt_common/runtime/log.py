@@ -70,7 +70,7 @@ class Log:
     def __init__(self, program: str, held: _HeldLog, *, as_json: bool, redaction: Redaction) -> None:
         self._logger = logging.getLogger(program)
         self._held = held
-        self._redaction = redaction
+        self.redaction = redaction
         self.as_json = as_json
         """One JSON object a line."""
 
@@ -87,7 +87,7 @@ class Log:
         try:
             yield
         except (UserError, FlightError) as error:
-            error.args = (self._redaction.text(str(error)),)
+            error.args = (self.redaction.text(str(error)),)
             if self.as_json:
                 self._write(logging.ERROR, str(error))
                 error.said = True

@@ -1,6 +1,6 @@
 """Parts that other packages install behind an entry point: found by name, loaded when named, never a traceback."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -61,15 +61,32 @@ def origin(entry: EntryPoint) -> str:
     return f"package {entry.dist.name} ({entry.value})" if entry.dist is not None else entry.value
 
 
+def brought(group: str, name: str, *, what: str, option: str, package: str) -> Any:
+    """The object of an extra that comes with HVT; `UserError` that ``option`` takes ``package`` where it is absent."""
+    entry = the_one(group, name, what=what, built_in=False)
+    if entry is None:
+        raise not_installed(option, package)
+    return loaded(entry, lambda found: found, what=what, install=f"'{package}'")
+
+
 def library_part(side: str, name: str) -> Any:
     """The function of that name with which another program runs a side; `UserError` without its extra."""
-    entry = the_one("hvt.library", side, what="library", built_in=False)
-    if entry is None:
-        raise not_installed(f"hvt_{side}.{name}", f"hvt[{side}]")
-    return loaded(entry, lambda found: found, what="library", install=f"'hvt[{side}]'")
+    return brought("hvt.library", side, what="library", option=f"hvt_{side}.{name}", package=f"hvt[{side}]")
 
 
-_GROUP = "hvt.health"
+def extra_command(side: str, words: Sequence[str], *, known: Collection[str]) -> Callable[[], int] | None:
+    """The command of an extra that a command line of ``hvt-edge`` or ``hvt-ground`` begins with; None for others.
+
+    It returns the exit code. Raises `UserError` for one of the ``known``, which come with HVT, without its extra.
+    """
+    name, group = words[0] if words else "", f"hvt.{side}_commands"
+    if name in known:
+        run = brought(group, name, what="command", option=f"hvt-{side} {name}", package=f"hvt[{side}]")
+    elif not name.startswith("-") and (entry := the_one(group, name, what="command", built_in=False)):
+        run = loaded(entry, lambda found: found, what="command")
+    else:
+        return None
+    return lambda: int(run(words[1:]))
 
 
 def health_server(
@@ -88,10 +105,7 @@ def health_server(
     not ready, empty if it is. Raises `UserError` where nothing can ever listen on the address, or the extra is not
     installed.
     """
-    entry = the_one(_GROUP, side, what="health server", built_in=False)
-    if entry is None:
-        raise not_installed("--metrics", "hvt[metrics]")
     # Only now: who is not watched needs no Prometheus.
-    serve = loaded(entry, lambda found: found, what="health server", install="'hvt[metrics]'")
+    serve = brought("hvt.health", side, what="health server", option="--metrics", package="hvt[metrics]")
     server = serve(address, newest, clock=clock, stuck_s=stuck_s, failures=failures, lacks=lacks)
     return cast("AbstractContextManager[object]", server)

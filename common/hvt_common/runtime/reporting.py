@@ -7,8 +7,10 @@ import logging
 import os
 import stat
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self, TextIO
 
@@ -19,7 +21,8 @@ from rich.text import Text
 
 from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read, telling
 from hvt_common.files import claim_name, is_output, takes_lock, write_whole
-from hvt_common.runtime.log import STATUS_LOGGER
+from hvt_common.runtime.log import STATUS_LOGGER, Log
+from hvt_common.runtime.process import ended_in_time
 from hvt_common.units import shown_text
 
 _log = logging.getLogger(__name__)
@@ -133,6 +136,26 @@ def reported(run: Callable[[], Any], report: Callable[[Any], None]) -> Any:
         raise
     report(summary)
     return summary
+
+
+def flown(
+    side: Any, stop: threading.Event, *, log: Log, path: Path | None, show: Callable[[Any], None]
+) -> Any:
+    """Run an edge or a ground until it ends or ``stop`` is set, and return its summary.
+
+    That goes into the log as JSON or to ``show``, and into the file ``path``: alone, if a list has one only.
+    """
+    before = version_of(path)
+
+    def report(summary: Any) -> None:
+        content = log.redaction.value(summary)
+        (log.result if log.as_json else show)(content)
+        if path is not None:
+            single = isinstance(content, list) and len(content) == 1
+            write_json(path, content[0] if single else content, before=before)
+
+    run = partial(ended_in_time, side.run, stop, in_hand=side.in_hand, otherwise=side.given_up)
+    return reported(run, report)
 
 
 def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) -> None:

@@ -7,9 +7,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import cast
 
-from hvt_common.errors import NotYetError, UserError, check_apart, not_installed
+from hvt_common.errors import NotYetError, UserError, check_apart
 from hvt_common.runtime.failures import Failures
-from hvt_common.runtime.plug_ins import loaded, the_one
+from hvt_common.runtime.plug_ins import brought
 from hvt_common.runtime.reporting import check_writable
 from hvt_edge.config import EdgeConfig
 from hvt_edge.source.folder import names_picture
@@ -39,11 +39,8 @@ def check_files(config: EdgeConfig) -> None:
 
 def open_local_copy(path: Path, *, failures: Failures, wait: bool) -> AbstractContextManager[LocalCopy]:
     """An extra's writer of the base stream to a file; ``wait``: it blocks where the card is slower (lockstep)."""
-    entry = the_one(_COPIES, "base", what="local copy", built_in=False)
-    if entry is None:
-        raise not_installed("--record-base", "hvt[edge]")
-    made = loaded(entry, lambda copy: copy(path, failures=failures, wait=wait), what="local copy")
-    return cast("AbstractContextManager[LocalCopy]", made)
+    opens = brought(_COPIES, "base", what="local copy", option="--record-base", package="hvt[edge]")
+    return cast("AbstractContextManager[LocalCopy]", opens(path, failures=failures, wait=wait))
 
 
 def store_folder(config: EdgeConfig) -> Path:
