@@ -40,12 +40,7 @@ class LiveView:
     """
 
     def __init__(
-        self,
-        kind: Literal["spawn", "serve"],
-        *,
-        port: int = 9876,
-        web_port: int = 9090,
-        later: bool = False,
+        self, kind: Literal["spawn", "serve"], *, port: int = 9876, web_port: int = 9090, later: bool = False
     ) -> None:
         self.kind = kind
         self.url = f"rerun+http://{HOST}:{port}/proxy"

@@ -5,13 +5,10 @@ from __future__ import annotations
 import ctypes
 import json
 import logging
-import os
-import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import zenoh
 from rich.console import Console
@@ -19,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.host_names import check_port
 from hvt_common.runtime.reporting import Finding
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
@@ -79,14 +77,12 @@ def check_clock() -> Finding:
     return Finding("ok", "the clock is synchronised")
 
 
-def check_folder(path: Path, *, name: str) -> int:
-    """Bytes that are free where it is, or will be made; `UserError` where nothing can be written."""
-    there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        raise UserError(
-            f"{name} {path} cannot be used, because {there} is no folder that can be written: name another"
-        )
-    return shutil.disk_usage(there).free
+def check_metrics(address: str | None) -> Finding:
+    """Whether ``--metrics`` could be served."""
+    if address is None:
+        return Finding("ok", "no --metrics")
+    check_port(address, name="--metrics", packages=["prometheus_client"])
+    return Finding("ok", f"{address} is free for --metrics")
 
 
 def _bounded(check: Callable[[], Finding], patience_s: float) -> Finding:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -15,8 +16,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.redaction import Redaction
-from hvt_common.runtime.host_names import check_port
-from hvt_common.runtime.reporting import Finding
+from hvt_common.runtime.reporting import Finding, check_folder
 from hvt_common.transport.session import declare_publisher
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
@@ -41,7 +41,7 @@ from hvt_edge.wiring import (
     surveyed,
 )
 from hvt_edge.world import World
-from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findings, run_checks
+from hvt_fleet.checkup import check_clock, check_link, check_metrics, print_findings, run_checks
 from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
 
 _DESCRIPTION = (
@@ -90,7 +90,7 @@ class _Checks:
             "codecs": self.codecs,
             "processor": self.processor,
             "files": self.files,
-            "ports": self.ports,
+            "ports": lambda: check_metrics(self._config.metrics),
             "clock": check_clock,
             "link": self.link,
         }
@@ -218,19 +218,12 @@ class _Checks:
         if not limit:
             return Finding("ok", "nothing is stored while the link is down")
         folder = store_folder(config)
-        free = check_folder(folder, name="--store-folder")
+        free = shutil.disk_usage(check_folder(folder, name="--store-folder")).free
         hours = 8 * limit / config.budget_bps / 3600
         found = f"{folder}: {limit / 1e6:.0f} MB for outages, {hours:.1f} hours; {free / 1e9:.1f} GB are free"
         if free < limit:
             return Finding("warning", found, "make room, or give --store less")
         return Finding("ok", found)
-
-    def ports(self) -> Finding:
-        """Those of the probes; the link's own are tried with it."""
-        if self._config.metrics is None:
-            return Finding("ok", "no --metrics")
-        check_port(self._config.metrics, name="--metrics", packages=["prometheus_client"])
-        return Finding("ok", f"{self._config.metrics} is free for --metrics")
 
     def link(self) -> Finding:
         """Keys, endpoints, another edge of this name, and a ground that listens."""

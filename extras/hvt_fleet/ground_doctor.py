@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,9 +14,8 @@ import zenoh
 from hvt_common.config import load
 from hvt_common.inference.detect import detect_every
 from hvt_common.protocol.channels import Channel, parse_key, selector
-from hvt_common.runtime.host_names import check_port
-from hvt_common.runtime.reporting import Finding, check_writable
-from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findings, run_checks
+from hvt_common.runtime.reporting import Finding, check_folder, check_writable
+from hvt_fleet.checkup import check_clock, check_link, check_metrics, print_findings, run_checks
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class, extras_of, written
 from hvt_ground.perception.models import Models
@@ -38,7 +38,7 @@ def run(argv: Sequence[str]) -> int:
     checks: dict[str, Callable[[], Finding]] = {
         "models": lambda: _models(config),
         "recordings": lambda: _recordings(config),
-        "ports": lambda: _ports(config),
+        "ports": lambda: check_metrics(config.metrics),
         **dict(one for extra in extras_of(config) for one in extra.checks(config).items()),
         "clock": check_clock,
         "link": lambda: check_link(config.link, _edges, other="edge"),
@@ -70,19 +70,12 @@ def _recordings(config: GroundConfig) -> Finding:
         else:
             check_folder(path, name=name)
     folder = config.record_folder or (Path() if config.record is None else config.record.absolute().parent)
-    free = check_folder(folder, name="--record")
+    free = shutil.disk_usage(check_folder(folder, name="--record")).free
     hours = 8 * free / _USUAL_BPS / 3600
     found = f"{folder.absolute()}: {free / 1e9:.1f} GB are free, {hours:.0f} hours of an edge at 1 Mbps"
     if hours < _LITTLE_H:
         return Finding("warning", found, "make room, or give --keep a size")
     return Finding("ok", found)
-
-
-def _ports(config: GroundConfig) -> Finding:
-    if config.metrics is None:
-        return Finding("ok", "no --metrics")
-    check_port(config.metrics, name="--metrics", packages=["prometheus_client"])
-    return Finding("ok", f"free: {config.metrics} for --metrics")
 
 
 def _edges(session: zenoh.Session) -> str:

@@ -190,10 +190,7 @@ def _shape(file: Any, area: _Area) -> tuple[int, int]:
 def _cell_in_the_middle(file: Any) -> None:
     # Read one, so that a model that cannot be read is refused before a flight.
     bounds = _bounds(file)
-    latitude, longitude = (
-        (bounds.south_deg + bounds.north_deg) / 2,
-        (bounds.west_deg + bounds.east_deg) / 2,
-    )
+    latitude, longitude = ((bounds.south_deg + bounds.north_deg) / 2, (bounds.west_deg + bounds.east_deg) / 2)
     across, down = _cell_deg(file, latitude)
     cell = _Area(longitude, latitude, longitude + across, latitude + down)
     _read(file, cell, (1, 1))
@@ -226,8 +223,7 @@ def _read(file: Any, area: _Area, shape: tuple[int, int]) -> npt.NDArray[np.floa
 
 def _window(file: Any, area: _Area) -> Window | None:
     longitude, latitude = np.meshgrid(
-        np.linspace(area.west_deg, area.east_deg, _ALONG),
-        np.linspace(area.south_deg, area.north_deg, _ALONG),
+        np.linspace(area.west_deg, area.east_deg, _ALONG), np.linspace(area.south_deg, area.north_deg, _ALONG)
     )
     x, y = (np.array(one) for one in transform(_WGS_84, file.crs, longitude.ravel(), latitude.ravel()))
     known = np.isfinite(x) & np.isfinite(y)

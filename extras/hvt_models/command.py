@@ -15,12 +15,7 @@ from hvt_common import __version__
 from hvt_common.errors import Parser, UserError, exit_with_sentence
 from hvt_common.inference.heads import HEAD_NAMES
 from hvt_common.inference.runtimes.plug_in import plug_in_names
-from hvt_common.inference.store import (
-    EMBEDDED_CLASSIFIER,
-    EMBEDDED_DETECTOR,
-    embedded_models,
-    resolve_model,
-)
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, embedded_models, resolve_model
 from hvt_common.runtime.process import interrupt_on_signals
 from hvt_models.manifest import ModelEntry
 from hvt_models.store import Store, file_digest
@@ -183,20 +178,20 @@ def _info(arguments: argparse.Namespace) -> int:
         head=arguments.head,
         labels=arguments.labels,
     )
-    names = report.class_names
+    names, model = report.class_names, report.model
     shown = ", ".join(names[:_SHOWN_CLASSES]) + (" …" if len(names) > _SHOWN_CLASSES else "")
     rows = [
-        ("file", str(report.path)),
+        ("file", str(model.path)),
         ("size", f"{report.size_bytes} bytes"),
-        ("SHA-256", file_digest(report.path)),
+        ("SHA-256", file_digest(model.path)),
         *(("opset", f"{domain or 'ai.onnx'} {version}") for domain, version in report.opsets.items()),
-        *(("input", str(port)) for port in report.inputs),
-        *(("output", str(port)) for port in report.outputs),
-        *((f"metadata {key}", value[:80]) for key, value in report.metadata.items()),
+        *(("input", str(port)) for port in model.inputs),
+        *(("output", str(port)) for port in model.outputs),
+        *((f"metadata {key}", value[:80]) for key, value in model.metadata.items()),
         ("adapter", report.adapter),
         ("because", report.because),
         ("classes", f"{len(names)}: {shown}" if names else "none"),
-        ("provider", report.provider),
+        ("provider", f"{model.provider.provider} ({model.provider.why})"),
     ]
     if report.median_ms is not None:
         rows.append(

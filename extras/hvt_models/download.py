@@ -35,12 +35,7 @@ class _InterruptedError(Exception):
 
 
 def download(
-    url: str,
-    part: Path,
-    *,
-    size_bytes: int,
-    progress: Progress,
-    pauses_s: Sequence[float] = (1.0, 2.0, 4.0),
+    url: str, part: Path, *, size_bytes: int, progress: Progress, pauses_s: Sequence[float] = (1.0, 2.0, 4.0)
 ) -> None:
     """Bring ``part`` to ``size_bytes``, continuing after the bytes that it holds; its content is not checked here.
 

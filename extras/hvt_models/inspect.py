@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier
 from hvt_common.inference.detect import OnnxDetector
-from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, Port, open_model
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.model_file import files_of, is_ir, opset_versions
 from hvt_models.heads import KINDS
 
@@ -27,18 +27,14 @@ _FREE_SIZE = (640, 384)
 class ModelReport:
     """The result of `inspect_model`."""
 
-    path: Path
+    model: OnnxModel
     size_bytes: int
     opsets: dict[str, int]
-    inputs: tuple[Port, ...]
-    outputs: tuple[Port, ...]
-    metadata: Mapping[str, str]
     adapter: str
     """detector, classifier or none."""
     because: str
     """The head and the preparation of pixels, or why no adapter fits."""
     class_names: tuple[str, ...]
-    provider: str
     timing: str
     """The timed operation; empty if nothing was timed."""
     median_ms: float | None
@@ -58,20 +54,10 @@ def inspect_model(
     """
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     adapter, because, class_names, once, timing = _fitted(model, head, labels)
-    return ModelReport(
-        path=path,
-        size_bytes=sum(file.stat().st_size for file in files_of(path)),
-        opsets={} if is_ir(path) else opset_versions(path),
-        inputs=model.inputs,
-        outputs=model.outputs,
-        metadata=model.metadata,
-        adapter=adapter,
-        because=because,
-        class_names=class_names,
-        provider=f"{model.provider.provider} ({model.provider.why})",
-        timing=timing,
-        median_ms=None if once is None else _median_ms(once),
-    )
+    size_bytes = sum(file.stat().st_size for file in files_of(path))
+    opsets = {} if is_ir(path) else opset_versions(path)
+    median_ms = None if once is None else _median_ms(once)
+    return ModelReport(model, size_bytes, opsets, adapter, because, class_names, timing, median_ms)
 
 
 def _fitted(

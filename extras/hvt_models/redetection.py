@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from hvt_common.inference.detect import FailingDetector, OnnxDetector
 from hvt_common.inference.retried import RetriedDetector
-from hvt_common.values import Boxes, Detections, Image, Posterior, View, iou
+from hvt_common.values import Boxes, Detections, Image, Posterior, View, intersections, iou
 from hvt_common.video.base_crop import resampled
 from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading, silent
 from hvt_ground.perception.stills.decode import DecodedStill, box_of
@@ -165,8 +165,5 @@ class Redetection:
 
 def _share_inside(boxes: Boxes, areas: Boxes) -> npt.NDArray[np.float64]:
     # (N, M): how much of each of N boxes lies in each of M areas, 0…1.
-    first = np.maximum(boxes[:, None, :2], areas[None, :, :2])
-    last = np.minimum(boxes[:, None, 2:], areas[None, :, 2:])
-    shared = np.clip(last - first, 0, None).prod(axis=2)
     whole = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None).prod(axis=1)
-    return np.asarray(shared / whole[:, None], np.float64)
+    return np.asarray(intersections(boxes, areas) / whole[:, None], np.float64)

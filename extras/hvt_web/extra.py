@@ -60,11 +60,7 @@ class WebExtra(Extra[WebOptions]):
         from hvt_common.transport.zenoh_config import key_pair  # noqa: PLC0415
 
         return WebPage(
-            config.web,
-            clock=clock,
-            failures=failures,
-            keys=key_pair(config.link),
-            proxy=config.web_proxy,
+            config.web, clock=clock, failures=failures, keys=key_pair(config.link), proxy=config.web_proxy
         )
 
 

@@ -49,9 +49,8 @@ class EdgeRequests:
             except RefusedError:
                 if frame is None:
                     raise
-                still = remote.still(
-                    box=place, timeout_s=_STILL_S
-                )  # that frame may be gone: the newest is there
+                # That frame may be gone: the newest is there.
+                still = remote.still(box=place, timeout_s=_STILL_S)
         header = still.header
         data = still.data if header.codec == "jpeg" else jpeg(still.image_bgr, quality_pct=90)
         return data, {"frame": header.frame_index, "captureNs": str(header.capture_ns), "place": place}

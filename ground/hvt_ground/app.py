@@ -37,14 +37,7 @@ from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import GroundLink, Group
 from hvt_ground.sinks import Outputs, Sink
-from hvt_ground.wiring import (
-    Models,
-    OpenSink,
-    SessionFactory,
-    check_outputs,
-    make_folders,
-    set_aside,
-)
+from hvt_ground.wiring import Models, OpenSink, SessionFactory, check_outputs, make_folders, set_aside
 
 _POLL_S = 0.1
 _STATUS_EVERY_POLLS = 10
@@ -183,12 +176,7 @@ class Ground:
             for one in services:
                 one.begin(client)
             factory = SessionFactory(
-                config,
-                models,
-                clock=self._clock,
-                outputs=outputs,
-                services=services,
-                program=self._program,
+                config, models, clock=self._clock, outputs=outputs, services=services, program=self._program
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             parts = _Parts(models, factory, services, watchers, outputs, line)

@@ -62,7 +62,7 @@ def origin(entry: EntryPoint) -> str:
 
 
 def brought(group: str, name: str, *, what: str, option: str, package: str) -> Any:
-    """The object of an extra that comes with HVT; `UserError` that ``option`` takes ``package`` where it is absent."""
+    """An extra's object; where it is not installed a `UserError` says that ``option`` takes ``package``."""
     entry = the_one(group, name, what=what, built_in=False)
     if entry is None:
         raise not_installed(option, package)

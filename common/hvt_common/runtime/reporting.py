@@ -119,9 +119,8 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     table.add_column(style="cyan", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(
-            Text(shown_text(name)), Text(shown_text(value))
-        )  # not markup: a path may have brackets in it
+        # Not markup: a path may have brackets in it.
+        table.add_row(Text(shown_text(name)), Text(shown_text(value)))
     with _going_on(sys.stdout):
         _Console(highlight=False).print(table)
 
@@ -183,6 +182,20 @@ def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) 
             pass
         if fresh:
             real.unlink()
+
+
+def check_folder(path: Path, *, name: str, otherwise: str = "") -> Path:
+    """The folder, or the nearest above it that is there; `UserError` where nothing can be written. Makes nothing."""
+    wanted = there = path.absolute()
+    usable = False
+    with contextlib.suppress(OSError):  # a part of the path cannot be read
+        there = next(one for one in (wanted, *wanted.parents) if one.exists())
+        usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    if not usable:
+        kind = UserError if there == wanted else NotYetError
+        because = f"because {there} is no folder that can be written: name another{otherwise}"
+        raise kind(f"{name} {path} cannot be used, {because}")
+    return there
 
 
 def write_json(

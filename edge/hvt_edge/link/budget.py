@@ -225,10 +225,8 @@ class RollingBudget:
             self._settings = replace(settings, total_bps=total_bps)
             self._total = total_bps * settings.window_ns / 8 / SECOND_NS
             self._events = [(at_ns, self._counted(size, then_bps)) for at_ns, size, then_bps in self._sent]
-            if (base_bps, fps) != (
-                settings.base_bps,
-                settings.fps,
-            ):  # from the next coded frame, a keyframe, on
+            # From the next coded frame, a keyframe, on.
+            if (base_bps, fps) != (settings.base_bps, settings.fps):
                 until_ns = max(now_ns, self._last_ns) + settings.window_ns
                 self._old_peak = (until_ns, max(self._base_peak, self._peak_at(now_ns)))
                 self._used.clear()

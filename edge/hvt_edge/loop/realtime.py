@@ -281,11 +281,7 @@ class LinkControl:
         return "link" if self.pacer is not None and self.pacer.holds(now_ns) else "budget"
 
     def finish(
-        self,
-        *,
-        stop: threading.Event,
-        note: Callable[[str], None],
-        turn: Callable[[], None] = lambda: None,
+        self, *, stop: threading.Event, note: Callable[[str], None], turn: Callable[[], None] = lambda: None
     ) -> None:
         """After the last frame of a recorded source: send stored objects, and call ``turn`` meanwhile."""
         self.transmitter.budget.end_base()

@@ -112,11 +112,7 @@ class Analyzer:
         return self.spent_ns / max(1, self.frames) / 1e6
 
     def analyze(
-        self,
-        frame: Frame,
-        unit: AccessUnit | None,
-        *,
-        skipped: Sequence[AccessUnit] = (),
+        self, frame: Frame, unit: AccessUnit | None, *, skipped: Sequence[AccessUnit] = ()
     ) -> AnalyzedFrame:
         """Analyze the next source frame; ``unit`` is None where it is not coded.
 

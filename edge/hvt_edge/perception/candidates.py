@@ -200,13 +200,7 @@ class TrackMemory:
     are forgotten first.
     """
 
-    def __init__(
-        self,
-        *,
-        padding: float = PADDING,
-        forget_s: float = 30.0,
-        max_tracks: int = 4096,
-    ) -> None:
+    def __init__(self, *, padding: float = PADDING, forget_s: float = 30.0, max_tracks: int = 4096) -> None:
         self._padding = padding
         self._forget_ns = round(forget_s * 1e9)
         self._max_tracks = max_tracks

@@ -300,9 +300,8 @@ class OnDemand:
         ``paced``: it goes to the link, which has to be free.
         """
         most_bytes = self.line.most_requested_bytes()
-        if (
-            pending.ready is None or len(pending.ready.data) > most_bytes
-        ):  # the rate may have fallen meanwhile
+        # The rate may have fallen meanwhile.
+        if pending.ready is None or len(pending.ready.data) > most_bytes:
             if not self._code_anew(pending, most_bytes, now_ns=now_ns):
                 return None
             assert pending.ready is not None, "it was coded just now"

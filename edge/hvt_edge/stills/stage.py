@@ -59,10 +59,7 @@ class StillStage:
         self.chooser.on_demand.ring.capture(frame)
 
     def analyze(
-        self,
-        frame: Frame,
-        unit: AccessUnit | None,
-        skipped: Sequence[AccessUnit] = (),
+        self, frame: Frame, unit: AccessUnit | None, skipped: Sequence[AccessUnit] = ()
     ) -> AnalyzedFrame:
         """Decode, detect and track one frame; ``unit`` is None for a frame that is not part of the base stream.
 

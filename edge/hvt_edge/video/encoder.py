@@ -1,13 +1,13 @@
 """The frame loop's contract with an encoder, its settings from a budget in line bits, and all encoders by name.
 
 There are x265 and those that packages install, as an extra the hardware encoders and passthrough: an entry point of
-the group ``hvt.encoders`` (`MakeEncoder`), imported when it is named.
+the group ``hvt.encoders``, imported when it is named: it makes an `Encoder` of `EncoderSettings`, or refuses them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, Protocol, cast
@@ -195,10 +195,6 @@ class Encoder(Protocol):
         any error: the frame is left out, and another encoder is opened.
         """
         ...
-
-
-MakeEncoder = Callable[[EncoderSettings], Encoder]
-"""The entry point of the group ``hvt.encoders``; it raises if it refuses the settings."""
 
 
 class CheckedEncoder:

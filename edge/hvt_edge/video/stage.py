@@ -187,9 +187,8 @@ class BaseStage:
         backlog, frame_bytes = self.backlog, round(budget.base_step_bytes)
         link = State.LIVE if backlog is None else backlog.state
         keyframe_due = self.keyframes.now(now_ns, fits=fits) or self._begins_anew
-        if (
-            link is State.LIVE and self.reconfigure is not None
-        ):  # a frame that fits no window needs another rate
+        # A frame that fits no window needs another rate.
+        if link is State.LIVE and self.reconfigure is not None:
             keyframe_due = keyframe_due or not budget.holds(frame_bytes)
         line_bytes = keyframe_bytes if keyframe_due else frame_bytes
         yields_to_keyframe = awaited and link is State.LIVE and not keyframe_due

@@ -17,12 +17,7 @@ from hvt_common.inference.detect import (
     open_detector,
     warm_up,
 )
-from hvt_common.inference.labels import (
-    declared_class_names,
-    default_confidence,
-    is_calibrated,
-    uncalibrated,
-)
+from hvt_common.inference.labels import declared_class_names, default_confidence, is_calibrated, uncalibrated
 from hvt_common.inference.retried import without_tiles
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
@@ -164,10 +159,7 @@ def make_shadow(
     if not config.measures or config.detector == MOTION:
         return None
     return ShadowGround(
-        without_tiles(detector),
-        confidence=track_confidence(config),
-        before=before,
-        cpu_budget=cpu_budget,
+        without_tiles(detector), confidence=track_confidence(config), before=before, cpu_budget=cpu_budget
     )
 
 

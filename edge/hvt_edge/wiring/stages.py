@@ -46,23 +46,11 @@ from hvt_edge.video.rate_model import PresetControl, share_of
 from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.stage import BaseStage, LocalCopy
 from hvt_edge.video.x265 import TrackRegions
-from hvt_edge.wiring.link import (
-    auto_settings,
-    channels_of,
-    make_budget,
-    make_pacer,
-    make_split,
-)
+from hvt_edge.wiring.link import auto_settings, channels_of, make_budget, make_pacer, make_split
 from hvt_edge.wiring.perception import make_analyzer, make_maker, make_method, make_shadow, make_suppression
 from hvt_edge.wiring.storing import open_local_copy, store_folder
 from hvt_edge.wiring.trial import Beginning
-from hvt_edge.wiring.video import (
-    Camera,
-    encoder_plan,
-    make_frame_skip,
-    make_keyframes,
-    make_reconfiguration,
-)
+from hvt_edge.wiring.video import Camera, encoder_plan, make_frame_skip, make_keyframes, make_reconfiguration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

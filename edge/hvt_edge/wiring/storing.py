@@ -7,10 +7,10 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import cast
 
-from hvt_common.errors import NotYetError, UserError, check_apart
+from hvt_common.errors import UserError, check_apart
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.plug_ins import brought
-from hvt_common.runtime.reporting import check_writable
+from hvt_common.runtime.reporting import check_folder, check_writable
 from hvt_edge.config import EdgeConfig
 from hvt_edge.source.folder import names_picture
 from hvt_edge.video.stage import LocalCopy
@@ -22,11 +22,7 @@ def check_files(config: EdgeConfig) -> None:
     """Raise `UserError` for a file or folder that cannot be written, or is also read, or belongs to another edge."""
     given = (config.source, config.pose, config.detector, config.labels, config.zenoh_config)
     reads = [Path(one) for one in given if one is not None]
-    files = (
-        ("--summary", config.summary),
-        ("--truth", config.truth),
-        ("--record-base", config.record_base),
-    )
+    files = (("--summary", config.summary), ("--truth", config.truth), ("--record-base", config.record_base))
     pictures = Path(os.path.realpath(config.source or ""))  # also of a link to itself
     for name, path in files:
         if path is not None and names_picture(path) and path.resolve().parent == pictures:
@@ -63,17 +59,7 @@ def default_folder(edge_id: str) -> Path:
 
 def check_store(config: EdgeConfig, *, live: bool) -> None:
     """Raise `UserError` now if a store could not be made in mid-flight; makes nothing."""
-    if not config.store_bytes(live=live):
-        return
-    path = store_folder(config)
-    try:
-        there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
-        usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
-    except OSError:  # a part of the path cannot be read
-        usable, there = False, path.absolute()
-    if not usable:
-        kind = UserError if there == path.absolute() else NotYetError
-        raise kind(
-            f"--store-folder {path} cannot be used, because {there} is no folder that can be written: name another, "
-            "or give --store 0 to store nothing"
+    if config.store_bytes(live=live):
+        check_folder(
+            store_folder(config), name="--store-folder", otherwise=", or give --store 0 to store nothing"
         )

@@ -82,7 +82,7 @@ class Camera(Protocol):
 
 
 class Passthrough(Protocol):
-    """The extra's entry point. Called with the `EncoderSettings` it is also a `MakeEncoder`."""
+    """The extra's entry point. Called with the `EncoderSettings` it makes an `Encoder`."""
 
     def open_source(self, spec: str, **settings: Any) -> Source:
         """As `hvt_edge.source.opening.open_source`; each frame has its `CameraUnit`."""
@@ -163,12 +163,7 @@ def _chosen(
     config: EdgeConfig, source_size: tuple[int, int], *, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], int]:
     likely_size = size or min(source_size, DEFAULT_SIZE)
-    rate_bps = payload_bps(
-        config.base_bps,
-        size=likely_size,
-        fps=config.nominal_fps,
-        edge_id=config.edge_id,
-    )
+    rate_bps = payload_bps(config.base_bps, size=likely_size, fps=config.nominal_fps, edge_id=config.edge_id)
     return choose_base(
         rate_bps,
         source_size,

@@ -220,10 +220,7 @@ def _parser() -> argparse.ArgumentParser:
         "recordings", metavar="FILE.rrd", type=Path, nargs="+", help="the files of one session, in any order"
     )
     parser.add_argument(
-        "--to",
-        metavar="KIND",
-        choices=_kinds(),
-        help=f"{', '.join(_kinds())} (default: by the end of --out)",
+        "--to", metavar="KIND", choices=_kinds(), help=f"{', '.join(_kinds())} (default: by the end of --out)"
     )
     parser.add_argument(
         "--out",

@@ -114,9 +114,8 @@ class _Content:
             for context in _values(chunk, "AnnotationContext:context"):
                 for one in context[0]:
                     self._names[one["class_id"]] = one["class_description"]["info"]["label"]
-            now = list(_values(chunk, "class_now")) or _values(
-                chunk, ":class_ids"
-            )  # an early HVT had one of them
+            # An early HVT had one of them.
+            now = list(_values(chunk, "class_now")) or _values(chunk, ":class_ids")
             for ids, classes in zip(_values(chunk, "track_id"), now, strict=False):
                 self._tracks |= dict.fromkeys(zip(ids, classes, strict=False))
         elif path == "/events":

@@ -168,8 +168,7 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         )
         for name in found.remove:
             self._remove(
-                name,
-                "all are larger than --keep allows, and it is the oldest of an edge above its share",
+                name, "all are larger than --keep allows, and it is the oldest of an edge above its share"
             )
         if self._doubted_ns is not None and now.steady_ns - self._doubted_ns < _DOUBT_NS:
             return
@@ -225,12 +224,7 @@ class RecordingsFolder(Service):
         self._clock = threading.Thread(target=self._poll, name="hvt-recordings", daemon=True)
 
     def begin(self, client: EdgeClient | None = None) -> None:  # noqa: ARG002 - no edge is asked
-        self._sink = QueuedSink(
-            "recordings index",
-            self._opened,
-            failures=self._failures,
-            unhurried=True,
-        )
+        self._sink = QueuedSink("recordings index", self._opened, failures=self._failures, unhurried=True)
 
     def _opened(self) -> IndexWriter:
         self._writer = IndexWriter(self._folder, self._retention, stop=self._stop)

@@ -60,10 +60,7 @@ class Camera:
         self._surveyed_bytes = measured.window_bytes
         self.fps, self.keyframe_s = stream.fps, stream.keyframe_s
         self.needed_bps = needed_bps(
-            self._surveyed_bytes,
-            window_s=config.window,
-            share=config.share,
-            metadata_bps=config.metadata_bps,
+            self._surveyed_bytes, window_s=config.window, share=config.share, metadata_bps=config.metadata_bps
         )
 
     def qualify(self, limit: Allowed) -> None:

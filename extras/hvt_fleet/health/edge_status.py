@@ -65,10 +65,7 @@ def _stills(state: dict[str, Any]) -> str:
 
 def _frames(state: dict[str, Any]) -> str:
     frames = state["frames"]
-    return _listed(
-        frames["account"]["text"],
-        _known(state["source_silent_s"], "newest {:.1f} s ago"),
-    )
+    return _listed(frames["account"]["text"], _known(state["source_silent_s"], "newest {:.1f} s ago"))
 
 
 def _takes(state: dict[str, Any]) -> str:

@@ -33,10 +33,7 @@ _GAUGES: Table[SessionState] = {
         "Of the camera.",
         lambda one: one.pose.longitude_deg if one.pose else None,
     ),
-    "hvt_pose_age_seconds": (
-        "Of that place.",
-        lambda one: one.pose.age_s if one.pose else None,
-    ),
+    "hvt_pose_age_seconds": ("Of that place.", lambda one: one.pose.age_s if one.pose else None),
     "hvt_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
     "hvt_tracks_refined": ("Of these, refined by a still.", lambda one: one.tracks_refined),
     "hvt_tracks_doubted": ("Shown, and doubted.", lambda one: one.tracks_doubted),

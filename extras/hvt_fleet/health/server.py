@@ -103,11 +103,7 @@ class HealthServer:
     """
 
     def __init__(
-        self,
-        address: str,
-        answers: Mapping[str, Callable[[], Answer]],
-        *,
-        failures: Failures,
+        self, address: str, answers: Mapping[str, Callable[[], Answer]], *, failures: Failures
     ) -> None:
         usual = "127.0.0.1:9464 for a ground, 127.0.0.1:9465 for an edge"
         host, port = host_and_port(address, name="--metrics", example=usual)

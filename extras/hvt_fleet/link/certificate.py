@@ -180,9 +180,8 @@ def _check_pair(pair: KeyPair, *, side: str, name: str | None, now_s: float) -> 
             f"--edge-id {name}: {pair.certificate} is the certificate of {certificate.name!r}, which may write as "
             f"{certificate.name!r} only: use that --edge-id, or the keys of {name} (hvt-ground keys add-edge {name})"
         )
-    if (
-        certificate.not_before_s > now_s
-    ):  # no error: a machine without a clock of its own learns the time later
+    # No error: a machine without a clock of its own learns the time later.
+    if certificate.not_before_s > now_s:
         _log.warning(
             "%s: this certificate holds from %s, and it is %s here: nobody lets it in before; is the clock right?",
             pair.certificate,

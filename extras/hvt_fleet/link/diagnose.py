@@ -101,11 +101,9 @@ class Watch(LinkWatch):
 
     @property
     def trouble(self) -> str:
-        """Why there is no link, in a sentence; empty while there is one, or nothing is known."""
         return self._trouble
 
     def may_command(self, edge: str) -> bool:
-        """Whether our own configuration lets questions on ``control`` of this edge out at all."""
         return self._rights.may_query(edge, Channel.CONTROL)
 
     def __enter__(self) -> Self:

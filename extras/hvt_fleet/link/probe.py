@@ -14,13 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass
 
 from hvt_common.errors import UserError
-from hvt_fleet.link.certificate import (
-    NO_CHECK_TIME,
-    Certificate,
-    TlsFiles,
-    dated,
-    plain_key_only,
-)
+from hvt_fleet.link.certificate import NO_CHECK_TIME, Certificate, TlsFiles, dated, plain_key_only
 
 _STEP_S = 3.0
 """Longest wait for a connection, and again for each answer."""

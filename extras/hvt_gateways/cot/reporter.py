@@ -250,10 +250,7 @@ def _why_unplaced(pose: Pose | None) -> str:
 
 
 def _platform_remarks(pose: Pose) -> str:
-    heights = (
-        (pose.height_m, "above the ground"),
-        (pose.altitude_m, "above mean sea level"),
-    )
+    heights = ((pose.height_m, "above the ground"), (pose.altitude_m, "above mean sea level"))
     return ", ".join(f"{metres:.0f} m {what}" for metres, what in heights if metres is not None)
 
 

@@ -221,9 +221,8 @@ def _has_place(known: dict[str, Any]) -> bool:
     place = known.get("GLOBAL_POSITION_INT")
     if place is None or max(abs(place.lat), abs(place.lon)) < _NOWHERE:
         return False
-    if (
-        abs(place.lat) > _MOST_LATITUDE or abs(place.lon) > 2 * _MOST_LATITUDE
-    ):  # the largest number: not known
+    # The largest number: not known.
+    if abs(place.lat) > _MOST_LATITUDE or abs(place.lon) > 2 * _MOST_LATITUDE:
         return False
     return not _has_no_fix(known)
 
@@ -261,9 +260,8 @@ def _camera(known: dict[str, Any], platform: Orientation | None) -> Orientation 
         return (
             None if platform is None else _orientation(mount.yaw + platform.yaw_deg, mount.pitch, mount.roll)
         )
-    status = known.get(
-        "MOUNT_STATUS"
-    )  # of before ArduPilot 4.3: pitch, roll and yaw to the vehicle, in 0.01 degrees
+    # Of before ArduPilot 4.3: pitch, roll and yaw to the vehicle, in 0.01 degrees.
+    status = known.get("MOUNT_STATUS")
     if status is None or platform is None:
         return None
     pitch, roll, yaw = (value / 100 for value in (status.pointing_a, status.pointing_b, status.pointing_c))

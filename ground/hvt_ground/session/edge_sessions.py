@@ -129,10 +129,6 @@ class EdgeSessions:
             self._stopped_ns = time.monotonic_ns()
             self.port.inbox.close()
 
-    def join(self, *, timeout_s: float = 4.0) -> bool:
-        """As `join`, of this one."""
-        return join([self], timeout_s=timeout_s)
-
     @property
     def finished(self) -> bool:
         return not self._thread.is_alive()

@@ -13,14 +13,7 @@ from typing import Any
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.edge_words import counts_text
-from hvt_common.protocol.messages import (
-    BaseHeader,
-    Info,
-    PoseReport,
-    RoiHeader,
-    Status,
-    TrackStep,
-)
+from hvt_common.protocol.messages import BaseHeader, Info, PoseReport, RoiHeader, Status, TrackStep
 from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Tracks

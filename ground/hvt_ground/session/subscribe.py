@@ -62,10 +62,7 @@ _MOST_ALIVE = 16384
 _QUIET_NS, _MOST_QUIET_NS = 2 * SECOND_NS, 64 * SECOND_NS
 """A present edge reports within this time; the longest pause before a channel on which nothing comes is subscribed to
 again."""
-_SUBSCRIBED = (
-    *(Channel.BASE, Channel.ROI, Channel.TRACKS),
-    *(Channel.POSE, Channel.BACKLOG, Channel.STATUS),
-)
+_SUBSCRIBED = (*(Channel.BASE, Channel.ROI, Channel.TRACKS), *(Channel.POSE, Channel.BACKLOG, Channel.STATUS))
 
 
 class GroundLink:

@@ -12,7 +12,8 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.host_names import check_port
-from hvt_fleet.checkup import Finding, check_clock, check_folder, print_findings, run_checks
+from hvt_common.runtime.reporting import check_folder
+from hvt_fleet.checkup import Finding, check_clock, print_findings, run_checks
 from programs.processes import eventually
 
 
@@ -96,7 +97,7 @@ def test_ports_folders_and_the_clock(tmp_path):
     for nonsense in ("nowhere", "127.0.0.1:http", "127.0.0.1:70000000"):
         with pytest.raises(UserError, match="give HOST:PORT"):
             check_port(nonsense, name="--metrics")
-    assert check_folder(tmp_path / "not" / "yet", name="--record") > 0
+    assert check_folder(tmp_path / "not" / "yet", name="--record") == tmp_path
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(UserError, match="is no folder that can be written"):
         check_folder(tmp_path / "file" / "below", name="--record")

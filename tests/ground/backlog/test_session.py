@@ -34,6 +34,7 @@ from hvt_ground.perception.session import FIRST_TRACK_ID
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.report.status import completed, summary, table
+from hvt_ground.session.edge_sessions import join
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import SLOTS
@@ -719,7 +720,7 @@ def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
     rig.base(*range(25))
     rig.base(*range(65, 70))
     rig.bring(chunks(flight.session_id, "base", 40, video_object(flight, range(40, 65))))
-    assert rig.receiver.join(timeout_s=200)
+    assert join([rig.receiver], timeout_s=200)
     assert rig.receiver.error is None
     assert not rig.receiver.failures.parts
     rig.outputs.close(within_s=60)

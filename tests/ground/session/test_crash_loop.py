@@ -25,7 +25,7 @@ from hvt_ground.backlog.edge_backlog import BacklogRecordings
 from hvt_ground.config import check
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import status_text, summary
-from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.edge_sessions import EdgeSessions, join
 from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs
@@ -146,7 +146,7 @@ def served(link: GroundLink, folder: Path, ended: list[str], clock: Clock) -> It
     try:
         yield sessions
     finally:
-        assert sessions.join(timeout_s=PATIENT_S)
+        assert join([sessions], timeout_s=PATIENT_S)
         outputs.close()
     assert sessions.error is None
 

@@ -23,7 +23,7 @@ from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session import edge_sessions
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.edge_sessions import EdgeSessions, join
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -152,7 +152,7 @@ def test_an_edge_of_which_all_but_the_pictures_comes_is_named(flight, tmp_path, 
     assert all("only small messages come" in one.reason for one in rig.sessions.failures.now)
     rig.put(0, 1)
     assert "FAILED" not in rig.said
-    assert rig.sessions.join()
+    assert join([rig.sessions])
 
 
 def test_an_edge_of_another_version_is_said_where_its_picture_would_be(flight, tmp_path):
@@ -171,7 +171,7 @@ def test_an_edge_of_another_version_is_said_where_its_picture_would_be(flight, t
     eventually(lambda: rig.inbox.handled, what="a second edge of that name is counted")
     assert "FAILED" not in rig.said
     assert rig.sessions.receiver.unusable == 2
-    assert rig.sessions.join()
+    assert join([rig.sessions])
 
 
 @pytest.mark.parametrize("how", ["ended", "damaged", "silent"])
@@ -187,7 +187,7 @@ def test_the_pictures_of_an_edge_fail_no_longer_than_it_sends_them(flight, tmp_p
     if how != "silent":
         rig.report(state="ended" if how == "ended" else "running")
     eventually(lambda: "FAILED" not in rig.said, what="it is over")
-    assert rig.sessions.join()
+    assert join([rig.sessions])
 
 
 CAUSES = {
@@ -223,7 +223,7 @@ def test_a_session_that_fails_ends_alone_and_begins_anew(flight, tmp_path, caplo
     assert rig.decoded[1] == 30, "from the next keyframe on"
     assert rig.sessions.failures.parts[0].working
     for one in (rig, neighbour):
-        assert one.sessions.join(timeout_s=60)
+        assert join([one.sessions], timeout_s=60)
         assert one.sessions.error is None
     lines = [one.getMessage() for one in caplog.records if one.levelno >= logging.WARNING]
     assert [one for one in lines if "all else goes on" in one] == [
@@ -277,7 +277,7 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert consumer.tried == 2
     assert rig.decoded == [4]
     assert rig.sessions.failures.parts[0].working
-    assert rig.sessions.join(timeout_s=60)
+    assert join([rig.sessions], timeout_s=60)
     assert sum("all else goes on" in one.getMessage() for one in caplog.records) == 1
 
 
@@ -307,7 +307,7 @@ def test_on_a_busy_machine_messages_that_had_come_are_taken_in_or_their_loss_sai
     monkeypatch.setattr(rig.inbox, "get", slow)
     for index in range(10, 10 + waiting):
         rig.inbox.put(flight.base(index))
-    assert rig.sessions.join()
+    assert join([rig.sessions])
     said = [one.reason for one in rig.sessions.failures.parts]
     assert rig.decoded == [13] if waiting == 3 else re.fullmatch(r"1[3-5] of the messages .*", *said)
     assert bool(said) == (waiting == 20)
@@ -319,7 +319,7 @@ def test_what_waits_behind_a_hole_is_received_though_nothing_more_comes(flight, 
     rig.put(0, 1, 3)
     session = rig.sessions.session
     eventually(lambda: session.reception.frames == 3, what="the one behind the hole is received")
-    assert rig.sessions.join(timeout_s=60)
+    assert join([rig.sessions], timeout_s=60)
 
 
 def test_a_flight_that_has_ended_holds_no_place(tmp_path):
@@ -327,6 +327,6 @@ def test_a_flight_that_has_ended_holds_no_place(tmp_path):
     rig = Rig(Flight(1), Consumer(tmp_path))
     rig.put(0)
     assert rig.port.used.is_set()
-    rig.sessions.join()
+    join([rig.sessions])
     assert rig.decoded == [1]
     assert not rig.port.used.is_set()

@@ -19,7 +19,7 @@ from hvt_ground.events import Event, Refinement
 from hvt_ground.perception.models import DetectorThread
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.edge_sessions import EdgeSessions, join
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Sink
 from programs.processes import eventually
@@ -521,7 +521,7 @@ def test_closing_keeps_what_has_arrived_and_ends(flight):
     rig.put(flight.base(0))
     eventually(lambda: bool(rig.opened))
     rig.put(*bases(flight, *range(1, 30)))
-    assert rig.receiver.join(timeout_s=60)
+    assert join([rig.receiver], timeout_s=60)
     (session,) = rig.ended
     assert session.frames_decoded == 30
     assert session.reception.analyzed[0] == 29

@@ -9,7 +9,7 @@ from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.session.edge_port import EdgePort, ReceiverReports
-from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.edge_sessions import EdgeSessions, join
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Sink
 from programs.processes import PATIENT_S, eventually
@@ -106,6 +106,6 @@ class ReceiverRig:
         return self
 
     def __exit__(self, kind, *_) -> None:
-        assert self.receiver.join(timeout_s=60), "the thread of the edge did not end"
+        assert join([self.receiver], timeout_s=60), "the thread of the edge did not end"
         if kind is None:  # else the test has failed already, and that is what is to be seen
             self._check()

@@ -12,14 +12,7 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.heads import HEAD_NAMES
-from hvt_common.inference.heads.contract import (
-    Array,
-    Decoder,
-    Head,
-    YoloxCells,
-    cell_grid,
-    rows_of,
-)
+from hvt_common.inference.heads.contract import Array, Decoder, Head, YoloxCells, cell_grid, rows_of
 from hvt_common.inference.letterbox import Anchor, Preparation
 from hvt_common.inference.store import MISSING, library_part, needed_part
 

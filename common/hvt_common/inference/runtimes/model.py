@@ -23,12 +23,7 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.letterbox import OwnSteps
-from hvt_common.inference.runtimes.model_file import (
-    check_onnx_file,
-    is_ir,
-    onnx_version,
-    opset_versions,
-)
+from hvt_common.inference.runtimes.model_file import check_onnx_file, is_ir, onnx_version, opset_versions
 from hvt_common.inference.runtimes.providers import (
     ONNXRUNTIME_PROVIDERS,
     OpenVinoCpu,

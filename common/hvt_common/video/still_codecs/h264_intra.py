@@ -94,10 +94,8 @@ def cabac_data(stream: bytes, *, qp: int, intra: bool) -> bytes:
         reader.ue()  # idr_pic_id
         found += [reader.u(2), 0]
     else:
-        found += [
-            reader.u(3 if unit[0] & 0x60 else 2),
-            reader.ue(),
-        ]  # a third bit where others may refer to it
+        # A third bit where others may refer to it.
+        found += [reader.u(3 if unit[0] & 0x60 else 2), reader.ue()]
     found += [initial_qp + reader.se(), reader.ue()]
     deblocking = not found[-1]
     found += [reader.se(), reader.se()] if deblocking else []

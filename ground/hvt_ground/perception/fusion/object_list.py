@@ -157,8 +157,7 @@ def _correction(entity: Entity, frame_index: int, rules: FusionRules) -> _Floats
     assert entity.correction is not None
     offset, since = entity.correction
     return np.asarray(
-        offset * (CORRECTION_WEIGHT * 0.5 ** (max(0, frame_index - since) / rules.half_life)),
-        np.float64,
+        offset * (CORRECTION_WEIGHT * 0.5 ** (max(0, frame_index - since) / rules.half_life)), np.float64
     )
 
 

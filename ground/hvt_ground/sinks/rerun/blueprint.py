@@ -32,12 +32,7 @@ MAP_TRACKS = "/map/tracks"
 EVENTS = "/events"
 SESSION = "/session"
 
-_BITRATE = (
-    ("total", WHITE, 1.5),
-    ("base", SKY, 2.0),
-    ("stills", AMBER, 2.0),
-    ("budget", VERMILLION, 1.5),
-)
+_BITRATE = (("total", WHITE, 1.5), ("base", SKY, 2.0), ("stills", AMBER, 2.0), ("budget", VERMILLION, 1.5))
 _LATENCY = (("to receive", SKY, 2.0), ("to overlay", AMBER, 2.0))
 _TRACKS = (("tracks", GREY, 2.0), ("refined", AMBER, 2.5))
 
@@ -211,8 +206,7 @@ def _video(
         name=name,
         background=_PAPER,
         visual_bounds=rrb.VisualBounds2D(
-            x_range=[0, base_size[0]],
-            y_range=[0, base_size[1] + points(LEGEND_POINTS, base_size[0])],
+            x_range=[0, base_size[0]], y_range=[0, base_size[1] + points(LEGEND_POINTS, base_size[0])]
         ),
         defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
         overrides={f"{root}{bare}": style.visualizer()} if bare is not None else None,

@@ -11,12 +11,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.rerun.sdk import (
-    RecordingId,
-    new_recording,
-    releasing_recordings,
-    send_blueprint,
-)
+from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 HOST = "127.0.0.1"
 

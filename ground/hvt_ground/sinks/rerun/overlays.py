@@ -92,12 +92,7 @@ class OverlayEncoder:
     """
 
     def __init__(
-        self,
-        size: tuple[int, int],
-        *,
-        share: float = 0.2,
-        credit_bytes: int = 16_384,
-        afresh: bool = False,
+        self, size: tuple[int, int], *, share: float = 0.2, credit_bytes: int = 16_384, afresh: bool = False
     ) -> None:
         self._size = size
         self._chosen: deque[int] = deque(maxlen=_MOST_CHOSEN)
