@@ -11,6 +11,7 @@ import logging
 import math
 import re
 from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -342,7 +343,11 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     # Not the copy of a part of another, nor a short one; the middle half: before a fix receivers say any time.
     least = max(2, max(map(len, placed.values()), default=0) / 10)
     long = {frozenset(one) for one in placed.values() if len(one) >= least}
-    ordered = [sorted(one) for one in long if not any(one < other for other in long)]
+    with_point: defaultdict[tuple[float, ...], list[frozenset[tuple[float, ...]]]] = defaultdict(list)
+    for one in long:
+        for place in one:
+            with_point[place].append(one)
+    ordered = [sorted(one) for one in long if not any(one < other for other in with_point[min(one)])]
     spans = sorted((one[len(one) // 4][0], one[-1 - len(one) // 4][0]) for one in ordered)
     if any(first[1] > second[0] for first, second in pairwise(spans)):
         raise UserError(
