@@ -28,9 +28,9 @@ _NAMED = re.compile(
 """But for latitudes and longitudes of 47 06.1, 47:06:01 or 47.06.01, whose degrees alone are another place."""
 _DEGREES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER})(?:{_BEHIND}|(?:\s?{_DEG}\b)?(?!\s+[\d+-]))")
 """Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter or word behind the number, of one of both at least; or none."""
-_SAYS_PLACE = re.compile(rf"\b(?:GPS\s*\(|{_LATLON})[^\],;)\n]{{0,40}}?\d")
+_SAYS_PLACE = re.compile(rf"\b(?:(?:GPS|RTK)\s*\(|{_LATLON})[^\],;)\n]{{0,40}}?\d")
 """A number where the first of a place stands, whether it is read or not."""
-_GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
+_GPS = re.compile(r"\b(?:GPS|RTK)\s*\(([^()\n]{1,80})\)")
 _HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})(?:\s*m\b|{_FEET[3:-2]})")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
 """Pitch, roll and yaw of the aircraft (F) and of the gimbal (G): Phantom 4 and Mavic Mini, all in one line."""
@@ -40,6 +40,7 @@ _DJI = {
     "longtitude": "longitude_deg",
     "rel_alt": "height_m",
     "barometer": "height_m",
+    "hb": "height_m",
     "abs_alt": "altitude_m",
     "gb_yaw": "camera_yaw_deg",
     "gb_pitch": "camera_pitch_deg",
