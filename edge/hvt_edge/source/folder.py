@@ -38,6 +38,7 @@ _LEAST_BANDS, _NEARLY = 4, 0.9
 """Bands of a camera, and the share of its pictures that have each."""
 _GREY_AND_ALPHA = (b"\2\1\3\0\2\0\0\0\x10\0\x10\0", b"\1\2\0\3\0\0\0\2\0\x10\0\x10")
 """TIFF's BitsPerSample (258) of 16 and 16, in both orders of bytes: OpenCV keeps eight."""
+_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _PNG, _PNG_KIND, _PNG_COLOUR = b"\x89PNG", 25, 2
 """How the file begins, the place of its colour type, and that type's bit for colour."""
 
@@ -232,6 +233,8 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
         if not data.size:
             return None
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        if image is None and _is_whole_jpeg(data.tobytes()):
+            data = np.append(data, np.frombuffer(_JPEG_END, np.uint8))
         if image is not None and image.ndim == 2 and image.dtype == np.uint8 and is_tiff(str(file)):
             image = _of_sixteen_bits(data.tobytes(), image)
         deep = stretch or Stretch(lambda _: None)
@@ -248,6 +251,17 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
     except (OSError, cv2.error):  # it has just gone, or its header claims too large a size
         return None
     return None if image is None else np.asarray(image, np.uint8)
+
+
+def _is_whole_jpeg(data: bytes) -> bool:
+    # Some programs leave out the end marker, without which OpenCV takes a JPEG for cut.
+    if not data.startswith(_JPEG):
+        return False
+    decoder = av.CodecContext.create("mjpeg", "r")
+    decoder.options = {"err_detect": "explode"}
+    with suppress(ValueError, av.error.FFmpegError):
+        return bool(decoder.decode(av.Packet(data)))
+    return False
 
 
 def _of_sixteen_bits(tiff: bytes, eight: npt.NDArray[Any]) -> npt.NDArray[Any]:
