@@ -5,7 +5,7 @@ import os
 import socket
 import stat
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,19 +18,19 @@ LISTENING = "0A"
 """The kernel's word for it in these tables, which Linux alone has."""
 
 
-def is_listening(endpoints: Iterable[str]) -> bool:
+def is_listening(endpoints: Iterable[str], *, before: Container[int]) -> bool:
     """Whether sockets of this process listen, or take datagrams, at each of these endpoints of Zenoh.
 
-    Linux says it: Zenoh does not say when its listener has come.
+    Linux says it: Zenoh does not say when its listener has come. Inodes of ``before`` are of other parts.
     """
-    here = {end for end, state in _own(TCP_TABLES) if state == LISTENING}
-    here |= {end for end, _ in _own(_UDP_TABLES)}
+    own = {inode for inode in own_sockets() if inode not in before}
+    here = {end for end, state in _ends(TCP_TABLES, own) if state == LISTENING}
+    here |= {end for end, _ in _ends(_UDP_TABLES, own)}
     return all(here & ends_of(end_of(one)) for one in endpoints)
 
 
-def _own(tables: Iterable[Path]) -> Iterator[tuple[str, str]]:
-    # End and state of each socket of this process.
-    own = own_sockets()
+def _ends(tables: Iterable[Path], own: Container[int]) -> Iterator[tuple[str, str]]:
+    # End and state of each of these sockets.
     for table in tables:
         with suppress(OSError):  # a kernel without IPv6
             for line in table.read_text(encoding="ascii").splitlines()[1:]:

@@ -21,7 +21,7 @@ from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, 
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.link_doctor import link_doctor
-from hvt_common.transport.own_sockets import is_listening
+from hvt_common.transport.own_sockets import is_listening, own_sockets
 from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
 
 _log = logging.getLogger(__name__)
@@ -76,6 +76,7 @@ def _open_listening_later(
     retry = {"period_init_ms": 500, "period_max_ms": 500, "period_increase_factor": 1.0}
     for key, value in (("timeout_ms", -1), ("exit_on_failure", False), ("retry", retry)):
         config.insert_json5(f"listen/{key}", json.dumps(value))
+    before = own_sockets()  # the page of this program may have the very port
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
@@ -84,7 +85,7 @@ def _open_listening_later(
     wanted = [endpoint for endpoint in listen if re.search(r":[1-9]\d*([?#]|$)", endpoint)]
 
     def bound() -> bool:
-        if not is_listening(wanted):
+        if not is_listening(wanted, before=before):
             raise NotYetError(why)
         return True
 
