@@ -127,7 +127,7 @@ class Ground:
         the run within seconds.
         """
         check_outputs(self._config, records=self._program is None)
-        models = self._models = Models(self._config)
+        models = self._models = Models(self._config, clock=self._clock)
         try:
             self._fly(models)
             if not all(one.finished for one in (*self._edges.values(), *self._leaving)):

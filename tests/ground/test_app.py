@@ -21,6 +21,7 @@ from hvt_ground import app
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import Extra, Service
+from hvt_ground.perception import models
 from hvt_ground.session import edge_sessions
 from hvt_ground.session.edge_sessions import EdgeSessions
 from programs.outsider import joined
@@ -96,6 +97,15 @@ def test_once_it_ends_when_nobody_comes_in_time(free_port: int, tmp_path: Path, 
     run.wait()
     assert run.sessions == []
     assert [one.read_text() for one in tmp_path.glob("earlier-*/f.rrd")] == ["flight"]
+
+
+def test_it_has_one_clock(free_port: int, tmp_path: Path, monkeypatch) -> None:
+    """A clock that was set in flight was said twice, by different seconds; failures had the second one's times."""
+    monkeypatch.setattr(models, "SteadyClock", None)
+    run = Run(config(free_port, tmp_path))
+    run.stop.set()
+    run.wait()
+    assert (run.sessions, run.error) == ([], None)
 
 
 def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path, clock) -> None:

@@ -158,7 +158,9 @@ def test_the_link_is_open_before_the_detector(compiler, free_port: int, monkeypa
     stop = threading.Event()
     config = listening(free_port)
     made: list[Models] = []
-    monkeypatch.setattr(app, "Models", lambda config: made.append(Models(config)) or made[-1])
+    monkeypatch.setattr(
+        app, "Models", lambda config, **clock: made.append(Models(config, **clock)) or made[-1]
+    )
     assert Ground(config, stop=stop, on_started=stop.set).run() == []
     with pytest.raises(NotOpenError, match="the run ends before"):
         made[0].take()

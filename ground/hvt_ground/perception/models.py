@@ -147,9 +147,9 @@ class Models:
     would each have half the cores, and take twice the memory and threads.
     """
 
-    def __init__(self, config: GroundConfig) -> None:
+    def __init__(self, config: GroundConfig, *, clock: Callable[[], int] | None = None) -> None:
         self._config = config
-        self.failures = Failures(SteadyClock())
+        self.failures = Failures(clock or SteadyClock())
         """Models whose run raised."""
         self.detector_thread = DetectorThread()
         self.facts = ModelFacts.of(config)  # a file that is not there is refused at once
