@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
@@ -79,20 +78,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="`make nightly` runs it"))
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection(session: pytest.Session) -> None:
-    """On a clean checkout one worker compiles all modules: each worker would do it, and all at the same time."""
-    cache, waits_until_s = session.config.cache, time.monotonic() + 120.0
-    while os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0" and time.monotonic() < waits_until_s:
-        if cache is None or cache.get("hvt/compiled", None):
-            break
-        time.sleep(0.2)
-
-
-def pytest_collection_finish(session: pytest.Session) -> None:
+def pytest_collection_finish() -> None:
     """Six thousand tests live as long as the process: the collector does not look through them again and again."""
-    if session.config.cache is not None:
-        session.config.cache.set("hvt/compiled", "all")
     gc.collect()
     gc.freeze()
 
