@@ -10,8 +10,9 @@ import argparse
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,7 +21,8 @@ from hvt_common.errors import UserError, exit_with_sentence, needs_extra
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 
-_START_S, _SETTLE_S = 30.0, 4.0
+T = TypeVar("T")
+_START_S, _SETTLE_S, _ANSWER_S = 30.0, 4.0, 120.0
 _MENU_PX = 37
 
 
@@ -62,15 +64,26 @@ def _picture(port: int, recording: Path, *, frame: int) -> bytes:
     from rerun.experimental import ViewerClient  # noqa: PLC0415
 
     client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-    client.open(str(recording.resolve()))
+    _answered(lambda: client.open(str(recording.resolve())))
     deadline = time.monotonic() + _START_S
-    while not any(r.timelines for r in client.get_state().recordings):
+    while not any(r.timelines for r in _answered(client.get_state).recordings):
         if time.monotonic() > deadline:
             raise UserError(f"recording {recording} holds nothing that the viewer can show")
         time.sleep(0.1)
-    client.set_time("frame", sequence=frame, play_state="paused")
+    _answered(lambda: client.set_time("frame", sequence=frame, play_state="paused"))
     time.sleep(_SETTLE_S)
-    return client.take_screenshot()
+    return _answered(client.take_screenshot)
+
+
+def _answered(ask: Callable[[], T]) -> T:
+    # Rerun waits for some seconds; a busy machine without a graphics card may draw for longer.
+    until_s = time.monotonic() + _ANSWER_S
+    while True:
+        try:
+            return ask()
+        except TimeoutError:
+            if time.monotonic() > until_s:
+                raise UserError(f"the viewer has not answered for {_ANSWER_S:g} s") from None
 
 
 def _without_menu(png: bytes) -> bytes:
