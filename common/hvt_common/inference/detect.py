@@ -313,10 +313,10 @@ class OnnxDetector:
         used = [outputs[index] for index in self.head.outputs]
         if not len(found.scores) and any(np.isnan(one).sum() > _BROKEN * one.size for one in used):
             raise UserError(f"model {self.model.path} answers a picture with what is no number (NaN)")
-        if not len(found.scores) and found.beyond:
+        if found.wrong:
             raise UserError(
-                f"model {self.model.path} answers a picture with confidences above 1: it is not {self.head.name},"
-                " or is broken"
+                f"model {self.model.path} answers a picture with {found.wrong}: it is not {self.head.name}, or is"
+                " broken"
             )
         return found, letterbox
 

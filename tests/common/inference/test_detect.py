@@ -121,7 +121,7 @@ def test_broken_numbers_never_become_detections(tmp_path):
         confidence=0.25,
         input_size=(64, 64),
     )
-    assert (len(queries.scores), queries.beyond) == (1, True)
+    assert (len(queries.scores), queries.wrong) == (1, "")
     rows = empty(9, 6)
     rows[0, :, 2:] = [5, 5, 0.9, np.nan]
     assert len(Listed(0, 4, 5)([rows], confidence=0.25, input_size=(64, 64)).scores) == 0

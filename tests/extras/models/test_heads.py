@@ -67,6 +67,7 @@ def test_channels_may_come_last(tmp_path: Path, family: str, dtype: int) -> None
     ("steps", "form"),
     [
         ([("Div", 255)], ".onnx"),
+        ([("Clip", 0), ("Div", 255)], ".onnx"),
         ([("Sub", 0), ("Div", [255] * 3)], ".onnx"),
         ([("Sub", 0), ("Div", [255] * 3)], ".xml"),
         ([("Gather", [2, 1, 0])], ".onnx"),
@@ -190,6 +191,10 @@ def test_an_answer_that_cannot_be_is_refused_in_words() -> None:
             detector.detect(picture())
     detector, _ = answering(ROWS[:, :0], ROWS[:, :0], ROWS[:, :0], ROWS[..., [5, 4, 0, 1, 2, 3]])
     with pytest.raises(UserError, match="confidences above 1: it is not end-to-end"):
+        detector.detect(picture())
+    by_centre = np.concatenate([(ROWS[..., :2] + ROWS[..., 2:4]) / 2, ROWS[..., 2:4] - ROWS[..., :2]], axis=2)
+    detector, _ = answering(ROWS[:, :0], ROWS[:, :0], ROWS[:, :0], np.dstack([by_centre, ROWS[..., 4:]]))
+    with pytest.raises(UserError, match="boxes that end before they begin: it is not end-to-end"):
         detector.detect(picture())
 
 

@@ -29,8 +29,8 @@ class HeadOutput:
     class_ids: npt.NDArray[np.int32]
     second: npt.NDArray[np.bool_] | None = None
     """(N,) which are of the second one of two networks in one file; None where there is one."""
-    beyond: bool = False
-    """Boxes with a score above 1 were left out: that is no probability."""
+    wrong: str = ""
+    """What most of the boxes had that were left out and no such network answers, in words; empty for nothing."""
 
 
 class Decoder(Protocol):
@@ -156,12 +156,15 @@ def valid(
     """Without boxes that are not finite, have no area or too little confidence; a broken number is no detection."""
     valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= _MOST_SCORE)
     valid &= np.isfinite(class_ids) & (class_ids >= 0) & (class_ids < _MOST_CLASSES)
+    inverted = valid & (boxes[:, 2:] < boxes[:, :2]).any(axis=1)
     valid &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
-    beyond = bool((scores > _MOST_SCORE).any())
+    wrong = "confidences above 1" if (scores > _MOST_SCORE).any() and not valid.any() else ""
+    if inverted.sum() > valid.sum():
+        wrong = "boxes that end before they begin"
     return HeadOutput(
         boxes[valid].astype(np.float32, copy=False),
         np.minimum(scores[valid], np.float32(1)),
         np.rint(class_ids[valid]).astype(np.int32),
         None if second is None else second[valid],
-        beyond,
+        wrong,
     )
