@@ -18,7 +18,9 @@ _TENSOR_TYPE, _TENSOR_FLOATS, _TENSOR_NAME, _TENSOR_RAW = 2, 4, 8, 9
 _TYPES = {1: "<f4", 6: "<i4", 7: "<i8", 10: "<f2", 11: "<f8"}
 _MOST_BYTES = 64
 _MOST_STEPS = 12
-_SAME = frozenset({"Cast", "Identity", "Transpose", "Squeeze", "Unsqueeze", "Reshape"})
+_SAME = frozenset(
+    {"Cast", "Identity", "Transpose", "Squeeze", "Unsqueeze", "Reshape", "Clip", "Clamp", "Pad", "Resize"}
+)
 _ARITHMETIC = frozenset({"Sub", "Add", "Mul", "Div"})
 _TURNING = {"Gather": 1, "Slice": 4, "StridedSlice": 3}
 """Operators that may reverse the channels, and the place of the input that decides it."""

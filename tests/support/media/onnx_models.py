@@ -58,7 +58,9 @@ def scaling_inside(path: Path, steps: Sequence[tuple[str, Any]]) -> Path:
             graph.input[0].type.tensor_type.elem_type = value or TensorProto.FLOAT
             constants = []
         else:
-            shape, dtype = ((-1,), np.int64) if kind == "Gather" else ((-1, 1, 1), np.float32)
+            shape, dtype = {"Gather": ((-1,), np.int64), "Clip": ((), np.float32)}.get(
+                kind, ((-1, 1, 1), np.float32)
+            )
             constants = [np.array(value, dtype).reshape(shape)]
         names = [f"by{number}_{place}" for place in range(len(constants))]
         graph.initializer.extend(map(numpy_helper.from_array, constants, names))
