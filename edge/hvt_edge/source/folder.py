@@ -246,8 +246,9 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
                 return deep.bgr(image, at_s=at_s)
         if image is not None and image.dtype == np.uint16:
             return deep.colours(np.asarray(image, np.uint16)[..., :3])
-        # Other images as OpenCV reads them: without transparency, in 8 bits, turned by their EXIF data.
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        if image is None or image.dtype != np.uint8 or image.shape[2:] != (3,):
+            # As OpenCV reads them: without transparency, in 8 bits.
+            image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     except (OSError, cv2.error):  # it has just gone, or its header claims too large a size
         return None
     return None if image is None else np.asarray(image, np.uint8)
