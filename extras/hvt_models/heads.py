@@ -127,9 +127,8 @@ def _yolov5(trial: Trial) -> Match | None:
     for index, _ in of_cells(trial, times=_ANCHORS_A_CELL):
         classes, table = trial.shape(index)[2] - 5, trial.table(index)
         if classes >= 1 and are_probabilities(table[:, 4:]):
-            return Match(
-                (index,), classes, Dense(objectness=True), "three rows a cell: box, objectness and scores"
-            )
+            decoder = Dense(objectness=True, one_class=classes == 1)
+            return Match((index,), classes, decoder, "three rows a cell: box, objectness and scores")
     return None
 
 

@@ -28,16 +28,19 @@ class Dense:
 
     objectness: bool = False
     transposed: bool = False
+    one_class: bool = False
+    """Objectness is the score: YOLOv7 trains no score of a single class, and writes one near 0.5."""
 
     def __call__(
         self, outputs: Sequence[Array], *, confidence: float, input_size: tuple[int, int]
     ) -> HeadOutput:
-        """Score is the best class score, times objectness."""
+        """Score is the best class score, times objectness; of ``one_class`` objectness alone."""
         table = outputs[0][0] if self.transposed else rows_of(outputs[0]).T  # (columns, A)
         first = 5 if self.objectness else 4
         sure = table[4] if self.objectness else table[4:].max(axis=0, initial=0)
         picked = table[:, np.flatnonzero(sure >= confidence)].T
-        scores, class_ids = best(picked[:, first:], picked[:, 4] if self.objectness else None)
+        columns = picked[:, 4:5] if self.one_class else picked[:, first:]
+        scores, class_ids = best(columns, picked[:, 4] if self.objectness and not self.one_class else None)
         boxes = _pixels(_corners(picked[:, :4], "centre"), input_size)
         return valid(boxes, scores, class_ids, confidence)
 

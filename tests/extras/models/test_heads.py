@@ -209,6 +209,17 @@ def test_an_angle_is_no_class(tmp_path: Path, names: dict[str, str], *, transpos
         opened(constant_model(tmp_path / "m.onnx", table, size=(96, 64), metadata=names))
 
 
+def test_yolov7_of_one_class_tells_by_objectness_alone(tmp_path: Path) -> None:
+    """Its class is not trained, and says 0.5: each confidence would be halved, and weak objects lost."""
+    table = np.tile(np.array([32, 32, 16, 16, 1e-3, 0.5], np.float32), (1, 3 * 126, 1))
+    table[0, 9, 4] = 0.4
+    detector = opened(
+        constant_model(tmp_path / "m.onnx", table, size=(96, 64), metadata={"names": "['rat']"})
+    )
+    found = detector.detect(np.full((64, 96, 3), 9, np.uint8))
+    assert (detector.head.name, found.confidences.tolist()) == ("yolov5", [np.float32(0.4)])
+
+
 @pytest.mark.parametrize("columns", [3, 4, 5])
 def test_rf_detr_may_have_any_number_of_classes(tmp_path: Path, columns: int) -> None:
     """One of three classes and "none", as wide as its boxes, was refused, with --head rf-detr too."""
