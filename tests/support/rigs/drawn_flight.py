@@ -19,7 +19,7 @@ from hvt_common.values import View, iou
 from hvt_scene import Scene
 from programs.processes import Link, free_ports
 
-FPS, FRAMES, SEED = 15, 45, 3
+FPS, FRAMES, SEED = 15, 30, 3
 SIZE = (640, 360)
 VIEW = View.fitted((1920, 1080), SIZE, fit="letterbox")
 
@@ -32,7 +32,7 @@ def scene() -> Scene:
 
 @dataclass(frozen=True)
 class DrawnFlight:
-    """What three seconds left: a folder with flight.rrd, .csv, .hvtlog and stills, both summaries.
+    """What two seconds left: a folder with flight.rrd, .csv, .hvtlog and stills, both summaries.
 
     And with the gateways flight.ts and CoT events.
     """
@@ -75,7 +75,7 @@ def receiving(port: int) -> Iterator[list[ET.Element]]:
 
 
 def fly(link: Link, *ground: str, edge: tuple[str, ...] = ()) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Three seconds of the scene, or what ``edge`` says; both summaries, and what the ground said."""
+    """Two seconds of the scene, or what ``edge`` says; both summaries, and what the ground said."""
     running = link.ground(
         "--once", "--provider", "cpu", "--record", "flight.rrd", "--tracks", "flight.csv", *ground
     )
