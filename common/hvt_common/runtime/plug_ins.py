@@ -61,12 +61,20 @@ def origin(entry: EntryPoint) -> str:
     return f"package {entry.dist.name} ({entry.value})" if entry.dist is not None else entry.value
 
 
-def brought(group: str, name: str, *, what: str, option: str, package: str) -> Any:
-    """An extra's object; where it is not installed a `UserError` says that ``option`` takes ``package``."""
+def brought(
+    group: str,
+    name: str,
+    *,
+    what: str,
+    option: str,
+    package: str,
+    make: Callable[[Any], Any] = lambda found: found,
+) -> Any:
+    """The result of ``make`` for an extra's object; `UserError` without it: ``option`` takes ``package``."""
     entry = the_one(group, name, what=what, built_in=False)
     if entry is None:
         raise not_installed(option, package)
-    return loaded(entry, lambda found: found, what=what, install=f"'{package}'")
+    return loaded(entry, make, what=what, install=f"'{package}'")
 
 
 def library_part(side: str, name: str) -> Any:

@@ -10,9 +10,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self, TextIO
+from typing import Any, Literal, Protocol, Self, TextIO, TypeVar
 
 from rich.console import Console
 from rich.live import Live
@@ -24,6 +23,9 @@ from hvt_common.files import claim_name, is_output, takes_lock, write_whole
 from hvt_common.runtime.log import STATUS_LOGGER, Log
 from hvt_common.runtime.process import ended_in_time
 from hvt_common.units import shown_text
+
+S = TypeVar("S")
+S_co = TypeVar("S_co", covariant=True)
 
 _log = logging.getLogger(__name__)
 
@@ -125,7 +127,7 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
         _Console(highlight=False).print(table)
 
 
-def reported(run: Callable[[], Any], report: Callable[[Any], None]) -> Any:
+def reported(run: Callable[[], S], report: Callable[[S], None]) -> S:
     """Return the summary of a flight after ``report`` of it, also of one that breaks off with a `FlightError`."""
     try:
         summary = run()
@@ -137,9 +139,19 @@ def reported(run: Callable[[], Any], report: Callable[[Any], None]) -> Any:
     return summary
 
 
+class Side(Protocol[S_co]):
+    """An edge or a ground, as a program runs it."""
+
+    def run(self) -> S_co: ...
+
+    def in_hand(self) -> frozenset[tuple[str, int]]: ...
+
+    def given_up(self) -> Exception: ...
+
+
 def flown(
-    side: Any, stop: threading.Event, *, log: Log, path: Path | None, show: Callable[[Any], None]
-) -> Any:
+    side: Side[S], stop: threading.Event, *, log: Log, path: Path | None, show: Callable[[S], None]
+) -> S:
     """Run an edge or a ground until it ends or ``stop`` is set, and return its summary.
 
     That goes into the log as JSON or to ``show``, and into the file ``path``: alone, if a list has one only.
@@ -153,8 +165,9 @@ def flown(
             single = isinstance(content, list) and len(content) == 1
             write_json(path, content[0] if single else content, before=before)
 
-    run = partial(ended_in_time, side.run, stop, in_hand=side.in_hand, otherwise=side.given_up)
-    return reported(run, report)
+    return reported(
+        lambda: ended_in_time(side.run, stop, in_hand=side.in_hand, otherwise=side.given_up), report
+    )
 
 
 def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) -> None:

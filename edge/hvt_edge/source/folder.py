@@ -39,6 +39,8 @@ _LEAST_BANDS, _NEARLY = 4, 0.9
 _GREY_AND_ALPHA = (b"\2\1\3\0\2\0\0\0\x10\0\x10\0", b"\1\2\0\3\0\0\0\2\0\x10\0\x10")
 """TIFF's BitsPerSample (258) of 16 and 16, in both orders of bytes: OpenCV keeps eight."""
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_RESTARTS_AT_EACH = b"\xff\xdd\0\4\0\1"
+"""A JPEG that begins anew at each block: it is whole for FFmpeg wherever it is cut."""
 _PNG, _PNG_KIND, _PNG_COLOUR = b"\x89PNG", 25, 2
 """How the file begins, the place of its colour type, and that type's bit for colour."""
 
@@ -256,7 +258,7 @@ def read_picture(file: Path, stretch: Stretch | None = None, *, at_s: float = 0.
 
 def _is_whole_jpeg(data: bytes) -> bool:
     # Some programs leave out the end marker, without which OpenCV takes a JPEG for cut.
-    if not data.startswith(_JPEG):
+    if not data.startswith(_JPEG) or _RESTARTS_AT_EACH in data:
         return False
     decoder = av.CodecContext.create("mjpeg", "r")
     decoder.options = {"err_detect": "explode"}
@@ -271,6 +273,8 @@ def _of_sixteen_bits(tiff: bytes, eight: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return eight
     with suppress(ValueError, av.error.FFmpegError):
         (frame,) = av.CodecContext.create("tiff", "r").decode(av.Packet(tiff))
+        if not frame.format.name.startswith("ya16"):
+            return eight
         grey = frame.reformat(format="gray16le").to_ndarray()
         if grey.shape == eight.shape and (grey // 256 + 1 >= eight).all():
             return grey

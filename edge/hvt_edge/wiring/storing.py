@@ -35,8 +35,15 @@ def check_files(config: EdgeConfig) -> None:
 
 def open_local_copy(path: Path, *, failures: Failures, wait: bool) -> AbstractContextManager[LocalCopy]:
     """An extra's writer of the base stream to a file; ``wait``: it blocks where the card is slower (lockstep)."""
-    opens = brought(_COPIES, "base", what="local copy", option="--record-base", package="hvt[edge]")
-    return cast("AbstractContextManager[LocalCopy]", opens(path, failures=failures, wait=wait))
+    copy = brought(
+        _COPIES,
+        "base",
+        what="local copy",
+        option="--record-base",
+        package="hvt[edge]",
+        make=lambda opens: opens(path, failures=failures, wait=wait),
+    )
+    return cast("AbstractContextManager[LocalCopy]", copy)
 
 
 def store_folder(config: EdgeConfig) -> Path:

@@ -347,7 +347,8 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     for one in long:
         for place in one:
             with_point[place].append(one)
-    ordered = [sorted(one) for one in long if not any(one < other for other in with_point[min(one)])]
+    beside = {one: min((with_point[place] for place in one), key=len) for one in long}
+    ordered = [sorted(one) for one in long if not any(one < other for other in beside[one])]
     spans = sorted((one[len(one) // 4][0], one[-1 - len(one) // 4][0]) for one in ordered)
     if any(first[1] > second[0] for first, second in pairwise(spans)):
         raise UserError(

@@ -28,9 +28,9 @@ _NAMED = re.compile(
 """But for latitudes and longitudes of 47 06.1, 47:06:01 or 47.06.01, whose degrees alone are another place."""
 _DEGREES = re.compile(rf"\b{_SIDE}\s*:?\s*({_NUMBER})|({_NUMBER})(?:{_BEHIND}|(?:\s?{_DEG}\b)?(?!\s+[\d+-]))")
 """Autel's GPS(E: 8.5, N: 47.1, 30.5m), or a letter or word behind the number, of one of both at least; or none."""
-_SAYS_PLACE = re.compile(rf"\b(?:(?:GPS|RTK)\s*\(|{_LATLON})[^\],;)\n]{{0,40}}?\d")
+_SAYS_PLACE = re.compile(rf"\b(?:GPS\s*\(|{_LATLON})[^\],;)\n]{{0,40}}?\d")
 """A number where the first of a place stands, whether it is read or not."""
-_GPS = re.compile(r"\b(?:GPS|RTK)\s*\(([^()\n]{1,80})\)")
+_GPS, _RTK = (re.compile(rf"\b{word}\s*\(([^()\n]{{1,80}})\)") for word in ("GPS", "RTK"))
 _HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})(?:\s*m\b|{_FEET[3:-2]})")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
 """Pitch, roll and yaw of the aircraft (F) and of the gimbal (G): Phantom 4 and Mavic Mini, all in one line."""
@@ -40,7 +40,7 @@ _DJI = {
     "longtitude": "longitude_deg",
     "rel_alt": "height_m",
     "barometer": "height_m",
-    "hb": "height_m",
+    "hb": "barometer_m",
     "abs_alt": "altitude_m",
     "gb_yaw": "camera_yaw_deg",
     "gb_pitch": "camera_pitch_deg",
@@ -62,7 +62,7 @@ def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[st
     times = list(_TIMES.finditer(text))  # whatever lines are empty: tools leave them out, or double them
     ends = (*(time.start() for time in times[1:]), len(text))
     blocks = [(time, text[time.end() : end]) for time, end in zip(times, ends, strict=False)]
-    founds = [found[1] for _, body in blocks if (found := _GPS.search(body)) is not None]
+    founds = [found[1] for _, body in blocks if (found := _found_place(body)) is not None]
     latitude_first = _latitude_first(founds, note)
     unplaced = unread = 0
     said: set[str] = set()
@@ -107,6 +107,8 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
             value = _value(said, feet=feet)
             value = value / parts if said.isdecimal() and value > least else value
             row[column] = -abs(value) if letter[:1].upper() == _NEGATIVE.get(column) else value
+    if (barometer_m := row.pop("barometer_m", None)) is not None:
+        row.setdefault("height_m", barometer_m)
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
         row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
@@ -114,13 +116,17 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
 
 
 def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
-    found = _GPS.search(body)
+    found = _found_place(body)
     if found is None or (degrees := _degrees(found[1])) is None:
         return {}
     said, first, second = degrees
     names = ("latitude_deg", "longitude_deg")
     names = names if (latitude_first if said is None else said) else names[::-1]
     return dict(zip(names, (first, second), strict=True))
+
+
+def _found_place(body: str) -> re.Match[str] | None:
+    return _GPS.search(body) or _RTK.search(body)  # beside GPS(…), RTK(…) may be its state
 
 
 def _degrees(text: str) -> tuple[bool | None, float, float] | None:

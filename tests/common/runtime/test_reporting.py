@@ -7,14 +7,25 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 from hvt_common import files
 from hvt_common.errors import FlightError, UserError, exit_with_sentence
 from hvt_common.files import write_whole
+from hvt_common.redaction import Redaction
 from hvt_common.runtime import reporting
-from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, version_of, write_json
+from hvt_common.runtime.log import Log
+from hvt_common.runtime.reporting import (
+    StatusLine,
+    check_writable,
+    flown,
+    print_table,
+    version_of,
+    write_json,
+)
 
 
 def test_the_summary_file_is_written_whole(tmp_path):
@@ -45,14 +56,43 @@ def test_a_summary_goes_into_a_pipe_and_through_a_link(tmp_path):
         assert json.loads(file.read_text()) == {"frames": frames}
 
 
+class Side:
+    """Its flight breaks off, and another run may end meanwhile."""
+
+    def __init__(self, summary, meanwhile):
+        self._summary, self._meanwhile = summary, meanwhile
+
+    def run(self):
+        self._meanwhile()
+        raise FlightError("it breaks off", summary=self._summary)
+
+    def in_hand(self):
+        return frozenset()
+
+    def given_up(self):
+        return FlightError("it hangs")
+
+
+def run_of(path, summary, *, other):
+    shown = []
+    with pytest.raises(FlightError, match="breaks off"):
+        flown(
+            Side(summary, other),
+            threading.Event(),
+            log=cast("Log", SimpleNamespace(redaction=Redaction(), as_json=False)),
+            path=path,
+            show=shown.append,
+        )
+    assert shown == [summary]
+
+
 def test_of_two_runs_at_once_none_loses_its_summary(tmp_path, caplog, monkeypatch):
     """The second ground of a script would replace the first one's; a script that runs again replaces the old one."""
     path, second = tmp_path / "summary.json", tmp_path / "summary-2.json"
-    for number in (1, 2):
-        before = version_of(path)
-        write_json(path, {"run": number}, before=before)
+    others = (list, list, lambda: write_json(path, {"run": 2}))
+    for number, other in zip((0, 1, 3), others, strict=True):
         assert not second.exists()
-    write_json(path, {"run": 3}, before=before)
+        run_of(path, {"run": number}, other=other)
     assert [json.loads(one.read_text())["run"] for one in (path, second)] == [2, 3]
     assert caplog.messages == [f"another run has written {path} meanwhile: this summary is in {second}"]
     before = version_of(path)
@@ -179,7 +219,6 @@ FLIGHT = """
 import logging, sys
 from pathlib import Path
 from hvt_common.errors import exit_with_sentence
-from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave
 from hvt_common.runtime.reporting import StatusLine, print_table, write_json
 def fly(argv):

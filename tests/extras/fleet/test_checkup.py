@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.host_names import check_port
 from hvt_common.runtime.reporting import check_folder
 from hvt_fleet.checkup import Finding, check_clock, print_findings, run_checks
@@ -99,6 +99,8 @@ def test_ports_folders_and_the_clock(tmp_path):
             check_port(nonsense, name="--metrics")
     assert check_folder(tmp_path / "not" / "yet", name="--record") == tmp_path
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(UserError, match="is no folder that can be written"):
-        check_folder(tmp_path / "file" / "below", name="--record")
+    for path, kind in ((tmp_path / "file", UserError), (tmp_path / "file" / "mounted later", NotYetError)):
+        with pytest.raises(kind, match="is no folder that can be written") as refused_folder:
+            check_folder(path, name="--record")
+        assert refused_folder.type is kind
     assert check_clock().state in ("ok", "warning", "unknown")

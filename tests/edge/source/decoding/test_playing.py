@@ -341,6 +341,14 @@ def test_grey_with_transparency_is_stretched_in_a_folder_too(tmp_path, kind, pix
         assert "stretched" in " ".join(source.notes)
 
 
+def test_grey_of_eight_bits_that_holds_the_bytes_of_that_tag_stays_as_it_is(tmp_path):
+    """It was stretched from black to white."""
+    grey = np.random.default_rng(3).integers(60, 121, (48, 64)).astype(np.uint8)
+    grey[0, :12] = (2, 1, 3, 0, 2, 0, 0, 0, 16, 0, 16, 0)
+    Image.fromarray(grey).save(tmp_path / "0.tif")
+    assert np.array_equal(play(tmp_path)[1][0][..., 0], grey)
+
+
 def test_a_tiled_tiff_of_grey_with_transparency_is_not_flat(tmp_path):
     """FFmpeg decodes the tiles of a GeoTIFF to one grey without an error."""
     grey = np.where(np.arange(64)[:, None] < 24, 7000, 14_000).repeat(64, axis=1)

@@ -287,6 +287,7 @@ def test_a_fixed_camera_is_where_it_was_put():
         ("GPS(36.9,-5.3,120)", (36.9, -5.3, None), "latitude, longitude, height"),
         ("GPS(8.2,47.4,16) BAROMETER:1.9", (47.4, 8.2, 1.9), "longitude, latitude, satellites"),
         ("GPS(8.2,47.4,16) Hb:1.9 Hs:0.0", (47.4, 8.2, 1.9), "longitude, latitude, satellites"),
+        ("RTK(50) GPS(8.2,47.4,16) BAROMETER:20 Hb:0.0", (47.4, 8.2, 20), "longitude, latitude, satellites"),
         (
             "RTK (8.2, 47.4, 28), HOME (8.3, 47.5, 103.55m), D 75.3m, H 76.2m",
             (47.4, 8.2, 76.2),
