@@ -158,7 +158,7 @@ def flown(
     """
     before = version_of(path)
 
-    def report(summary: Any) -> None:
+    def report(summary: S) -> None:
         content = log.redaction.value(summary)
         (log.result if log.as_json else show)(content)
         if path is not None:

@@ -84,8 +84,8 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
         _utc(row.begin_ns),
         lasted,
         f"{row.size_bytes / 1e6:.1f}",
-        str(row.frames) if row.session else "",
-        str(row.stills) if row.session else "",
+        str(row.frames) if _counted(row) else "",
+        str(row.stills) if _counted(row) else "",
         " ".join([classes, *notes]).strip(),
     )
     # Names come from the wire: none may move the cursor.
@@ -93,16 +93,22 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
 
 
 def _as_json(row: RecordingRow, folder: Path) -> dict[str, object]:
-    unknown = {} if row.session else dict.fromkeys(("session", "frames", "stills", "classes", "video"))
+    unknown = () if _counted(row) else ("frames", "stills", "classes")
+    unread = () if row.session else ("session", "video")
     return (
         asdict(row)
-        | unknown
+        | dict.fromkeys((*unknown, *unread))
         | {
             "path": str(folder / row.file),
             "begin": _utc(row.begin_ns) or None,
             "end": _utc(row.end_ns) or None,
         }
     )
+
+
+def _counted(row: RecordingRow) -> bool:
+    # The row of a file that has just begun, or was not read yet, counts nothing.
+    return bool(row.session) and (row.whole or row.begin_ns is not None)
 
 
 def _utc(unix_ns: int | None) -> str:

@@ -219,6 +219,7 @@ FLIGHT = """
 import logging, sys
 from pathlib import Path
 from hvt_common.errors import exit_with_sentence
+from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave
 from hvt_common.runtime.reporting import StatusLine, print_table, write_json
 def fly(argv):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,31 @@ def test_what_was_not_read_yet_is_said_to_be_so(folder, capsys):
         == "135.0 (not read yet)"
     )
     assert err == ""
+
+
+def test_what_a_ground_wrote_before_it_was_killed_is_not_said_to_be_nothing(folder, capsys):
+    """Its file has pictures, of which the index counts none yet: with 0 frames it would be thrown away."""
+    index = Index(folder)
+    began = row("d.rrd", "uav-3", NOON_NS, {}, frames=0, stills=0, whole=False)
+    index.put(replace(began, begin_ns=None, end_ns=None, size_bytes=300_000))
+    index.close()
+    hvt_ground.cli.main(["recordings", "list", str(folder)])
+    line = next(one for one in capsys.readouterr().out.splitlines() if "d.rrd" in one)
+    assert line.split() == [
+        "d.rrd",
+        "uav-3",
+        "0.3",
+        "(being",
+        "written,",
+        "or",
+        "its",
+        "ground",
+        "was",
+        "killed)",
+    ]
+    hvt_ground.cli.main(["recordings", "find", str(folder), "--edge", "uav-3", "--json"])
+    (one,) = json.loads(capsys.readouterr().out)
+    assert (one["session"], one["frames"], one["stills"], one["classes"]) == ("00ff", None, None, None)
 
 
 def test_as_json(folder, capsys):
