@@ -1,6 +1,7 @@
 """The Matroska file of the base stream."""
 
 import os
+import select
 import shutil
 import time
 from contextlib import suppress
@@ -156,14 +157,15 @@ def test_a_card_that_hangs_costs_no_frame(tmp_path):
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     coded = units(40)
-    recorder = LocalCopy(pipe, failures=failures)
+    recorder = LocalCopy(pipe, failures=failures, pause=RetryPause(1000 * SECOND_NS))
+    recorder.write(coded[0])
+    eventually(lambda: bool(select.select([reader], [], [], 0)[0]))
     for _ in range(40):
         for unit in coded:
             recorder.write(unit)  # one that waited would wait for ever
     assert "takes no more" in failures.parts[0].reason
     os.close(reader)  # which ends the write that hangs
     recorder.close()
-    os.close(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))  # which ends another try
 
 
 def test_a_pipe_that_takes_nothing_is_not_removed(tmp_path):
